@@ -1,0 +1,1 @@
+"""What is measured: lidars, classes, geometry, maps, scans and the lines in them."""

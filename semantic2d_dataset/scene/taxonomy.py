@@ -1,0 +1,127 @@
+"""Classes: their ids, names and colours."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic2d_dataset.errors import InvalidInputError
+
+UNLABELLED = 255
+"""The id of a beam or cell that has no label."""
+
+# Spellings met in published files, in the normal form of `_plain`.
+_ALIASES = {
+    "people": "person",
+    "pedestrian": "person",
+    "background": "other",
+    "trash can": "trash bin",
+    "trashbin": "trash bin",
+}
+
+
+def _plain(name: str) -> str:
+    words = " ".join(re.split(r"[\s_\-]+", name.strip().lower())).strip()
+    return _ALIASES.get(words, words)
+
+
+@dataclass(frozen=True)
+class Taxonomy:
+    """Class names by id, and their colours.
+
+    Parameters
+    ----------
+    names
+        Name of each class; its position is its id.
+    colours
+        One RGB triple 0..255 for each class.
+    background_id
+        The class that collects everything else; never part of a mean.
+    """
+
+    names: tuple[str, ...]
+    colours: tuple[tuple[int, int, int], ...]
+    background_id: int = 0
+
+    def __post_init__(self) -> None:
+        if not 2 <= len(self.names) <= UNLABELLED:
+            raise InvalidInputError(f"expected 2 to 255 class names, found {len(self.names)}")
+        if len(self.colours) != len(self.names):
+            raise InvalidInputError(
+                f"expected {len(self.names)} colours, one for each class, found {len(self.colours)}"
+            )
+        if not all(name.isprintable() and name.strip() for name in self.names):
+            raise InvalidInputError(f"class names must be printable text, found {self.names!r}")
+        if len({_plain(name) for name in self.names}) != len(self.names):
+            raise InvalidInputError(f"class names must differ, found {self.names}")
+        if not 0 <= self.background_id < len(self.names):
+            raise InvalidInputError(f"no class has the id {self.background_id}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def scored_ids(self) -> tuple[int, ...]:
+        """Ids of the classes that enter a mean: all but the background."""
+        return tuple(i for i in range(len(self.names)) if i != self.background_id)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of names, colours and background id, hex."""
+        text = json.dumps([self.names, self.colours, self.background_id], ensure_ascii=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def palette(self) -> NDArray[np.uint8]:
+        """Colours as a look-up table (256, 3) u1 by label; unlabelled is light grey."""
+        table = np.full((256, 3), 235, np.uint8)
+        table[: len(self.names)] = self.colours
+        return table
+
+    def id_of(self, name: str) -> int:
+        """Return the id of a class by its name, whatever its case or published spelling.
+
+        Raises
+        ------
+        InvalidInputError
+            If no class has that name.
+        """
+        wanted = _plain(name)
+        for i, known in enumerate(self.names):
+            if _plain(known) == wanted:
+                return i
+        raise InvalidInputError(f"unknown class {name!r}; known are {', '.join(self.names)}")
+
+
+# Ids and colours as in the published release.
+SEMANTIC2D = Taxonomy(
+    names=(
+        "Other",
+        "Chair",
+        "Door",
+        "Elevator",
+        "Person",
+        "Pillar",
+        "Sofa",
+        "Table",
+        "Trash bin",
+        "Wall",
+    ),
+    colours=(
+        (0, 0, 0),
+        (109, 0, 156),
+        (0, 46, 221),
+        (0, 164, 187),
+        (204, 204, 204),
+        (0, 155, 18),
+        (0, 225, 0),
+        (203, 249, 0),
+        (255, 173, 0),
+        (227, 0, 0),
+    ),
+)
