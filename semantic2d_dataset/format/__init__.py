@@ -1,0 +1,1 @@
+"""What is stored: sequences, manifests and splits."""

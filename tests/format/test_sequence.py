@@ -1,0 +1,204 @@
+import multiprocessing
+import pickle
+import tempfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.format.schema import FORMAT_VERSION
+from semantic2d_dataset.format.sequence import (
+    SequenceHeader,
+    SequenceReader,
+    SequenceWriter,
+    slug,
+)
+from semantic2d_dataset.scene.lidars import LIDARS
+from tests.generators import SMALL_LIDAR, make_arrays, make_map, make_sequence
+
+
+def test_everything_reads_back_as_written(tmp_path):
+    path = tmp_path / "a.h5"
+    written = make_sequence(path, 150)
+    with SequenceReader(path) as reader:
+        for name, values in written.items():
+            np.testing.assert_array_equal(reader.read(name), values)
+            assert reader.read(name).dtype == values.dtype
+        scene = reader.read_map()
+        header = reader.header
+    assert scene is not None
+    np.testing.assert_array_equal(scene.occupancy, make_map().occupancy)
+    np.testing.assert_array_equal(scene.labels, make_map().labels)
+    assert (scene.resolution, scene.origin) == (make_map().resolution, make_map().origin)
+    assert header.sequence_id == "lobby--first--small"
+    assert header.lidar == SMALL_LIDAR
+    assert header.provenance == {"source": "generated", "seed": 0}
+    assert (header.license, header.stamps_source) == ("CC0-1.0", "synthetic")
+
+
+@pytest.mark.parametrize("lidar", LIDARS.values(), ids=list(LIDARS))
+def test_each_lidar_of_the_release_is_kept_to_the_last_bit(lidar, tmp_path):
+    make_sequence(tmp_path / "a.h5", 3, lidar=lidar)
+    assert SequenceReader(tmp_path / "a.h5").lidar == lidar
+
+
+floats = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=12)
+@given(st.data(), st.integers(0, 70))
+def test_any_ranges_labels_and_stamps_survive(data, scans):
+    ranges = data.draw(arrays(np.float32, (scans, 37), elements=floats, fill=floats))
+    labels = data.draw(arrays(np.uint8, (scans, 37)))
+    stamps = np.sort(data.draw(arrays(np.int64, scans)))
+    header = SequenceHeader(environment="a", recording="b", lidar=SMALL_LIDAR)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.h5"
+        with SequenceWriter(path, header) as writer:
+            for part in (slice(0, scans // 3), slice(scans // 3, None)):
+                writer.append(
+                    {
+                        "scans/ranges": ranges[part],
+                        "scans/labels": labels[part],
+                        "scans/stamps_ns": stamps[part],
+                    }
+                )
+        with SequenceReader(path) as reader:
+            assert reader.read("scans/ranges").tobytes() == ranges.tobytes()
+            np.testing.assert_array_equal(reader.read("scans/labels"), labels)
+            np.testing.assert_array_equal(reader.read("scans/stamps_ns"), stamps)
+
+
+def test_block_size_while_writing_changes_nothing(tmp_path):
+    written = make_arrays(130)
+    digests = []
+    for step in (1000, 64, 7):
+        path = tmp_path / f"{step}.h5"
+        header = SequenceHeader(environment="a", recording="b", lidar=SMALL_LIDAR)
+        with SequenceWriter(path, header) as writer:
+            for start in range(0, 130, step):
+                writer.append({n: a[start : start + step] for n, a in written.items()})
+        digests.append(SequenceReader(path).content_digest())
+    assert len(set(digests)) == 1
+
+
+def test_content_digest_ignores_licence_and_provenance_but_no_bit_of_data(tmp_path):
+    digests = {}
+    for name, seed, kind in (("a", 0, "x"), ("b", 0, "y"), ("c", 1, "x")):
+        path = tmp_path / f"{name}.h5"
+        header = SequenceHeader(
+            environment="a", recording="b", lidar=SMALL_LIDAR, license=kind, provenance={"k": kind}
+        )
+        with SequenceWriter(path, header) as writer:
+            writer.append(make_arrays(10, seed=seed))
+        digests[name] = SequenceReader(path).content_digest()
+    assert digests["a"] == digests["b"] != digests["c"]
+
+
+def test_content_digest_tells_dtypes_apart(tmp_path):
+    digests = set()
+    for dtype in ("<f4", "<i4"):
+        path = tmp_path / f"{dtype[1:]}.h5"
+        with SequenceWriter(path, SequenceHeader("a", "b", SMALL_LIDAR)) as writer:
+            writer.append(make_arrays(4) | {"original/x": np.zeros(4, dtype)})
+        digests.add(SequenceReader(path).content_digest())
+    assert len(digests) == 2
+
+
+def test_batch_takes_refined_poses_then_initial_then_none(tmp_path):
+    written = make_sequence(tmp_path / "a.h5", 20)
+    make_sequence(tmp_path / "b.h5", 20, drop=("poses/refined",))
+    make_sequence(tmp_path / "c.h5", 20, drop=("poses/refined", "poses/initial"))
+    poses = [SequenceReader(tmp_path / f"{n}.h5").batch(5, 9).poses for n in "abc"]
+    np.testing.assert_array_equal(poses[0], written["poses/refined"][5:9])
+    np.testing.assert_array_equal(poses[1], written["poses/initial"][5:9])
+    assert poses[2].shape == (4, 3)
+    assert np.isnan(poses[2]).all()
+
+
+def test_batch_without_intensities_and_labels_says_so(tmp_path):
+    path = tmp_path / "a.h5"
+    make_sequence(path, 5, drop=("scans/intensities", "scans/labels"))
+    batch = SequenceReader(path).batch()
+    assert batch.intensities is None
+    assert batch.labels is None
+    assert "scans/labels" not in SequenceReader(path)
+
+
+def read_some(reader, start, queue):
+    queue.put(reader.read("scans/ranges", start, start + 10).tobytes())
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_an_open_reader_works_in_other_processes(method, tmp_path):
+    path = tmp_path / "a.h5"
+    ranges = make_sequence(path, 150)["scans/ranges"]
+    reader = SequenceReader(path)
+    reader.read("scans/ranges", 0, 1)
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    starts = [0, 60, 120]
+    workers = [context.Process(target=read_some, args=(reader, s, queue)) for s in starts]
+    for worker in workers:
+        worker.start()
+    found = {queue.get(timeout=60) for _ in workers}
+    for worker in workers:
+        worker.join()
+    assert found == {ranges[s : s + 10].tobytes() for s in starts}
+
+
+def test_reader_pickles_without_its_handle(tmp_path):
+    make_sequence(tmp_path / "a.h5", 10)
+    reader = SequenceReader(tmp_path / "a.h5")
+    again = pickle.loads(pickle.dumps(reader))
+    reader.close()
+    np.testing.assert_array_equal(again.read("scans/labels"), reader.read("scans/labels"))
+
+
+def test_arrays_that_do_not_fit_each_other_are_refused(tmp_path):
+    path = tmp_path / "a.h5"
+    make_sequence(path, 10)
+    with h5py.File(path, "r+") as file:
+        file["scans/labels"].resize(9, axis=0)
+    with pytest.raises(CorruptFileError, match="scans/labels: expected 10 rows, found 9"):
+        SequenceReader(path)
+
+
+def test_sequence_id_must_be_that_of_its_parts(tmp_path):
+    path = tmp_path / "a.h5"
+    make_sequence(path, 10)
+    with h5py.File(path, "r+") as file:
+        file.attrs["sequence_id"] = np.bytes_(b"lobby--second--small")
+    with pytest.raises(CorruptFileError, match="expected the sequence id lobby--first--small"):
+        SequenceReader(path)
+
+
+def test_file_is_marked_with_format_and_readable_by_hdf5_110(tmp_path):
+    path = tmp_path / "a.h5"
+    make_sequence(path, 10)
+    assert path.read_bytes()[8] == 3  # superblock version 3: HDF5 1.10
+    with h5py.File(path) as file:
+        assert file.attrs["format_version"].decode() == FORMAT_VERSION
+        assert file["scans/ranges"].fletcher32
+
+
+@pytest.mark.parametrize("name", ["Lobby", "a--b", "", "a/b", "-a", "a b", "ä"])
+def test_names_that_no_sequence_id_may_hold_are_refused_with_a_proposal(name):
+    with pytest.raises(InvalidInputError, match="such as"):
+        SequenceHeader(environment=name, recording="b", lidar=SMALL_LIDAR)
+
+
+@given(st.text())
+def test_any_text_becomes_a_valid_name(text):
+    SequenceHeader(environment=slug(text), recording="b", lidar=SMALL_LIDAR)
+
+
+def test_unknown_stamps_source_is_refused():
+    with pytest.raises(InvalidInputError, match="stamps_source"):
+        SequenceHeader(environment="a", recording="b", lidar=SMALL_LIDAR, stamps_source="guess")
