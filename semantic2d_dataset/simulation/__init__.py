@@ -1,0 +1,1 @@
+"""Exact truth: simulated buildings, people and lidars."""
