@@ -1,0 +1,1 @@
+"""How good it is: the evaluator and the predictions that it scores."""
