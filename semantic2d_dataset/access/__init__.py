@@ -1,0 +1,1 @@
+"""How to get it: known data sets, model inputs and PyTorch Datasets."""
