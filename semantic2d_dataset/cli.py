@@ -1,0 +1,312 @@
+"""The ``semantic2d`` command.
+
+Every command imports what it needs when it runs, so that ``semantic2d --help`` is quick. The
+commands of the sibling packages are looked up by name when they are called.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+import semantic2d_dataset
+from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
+
+if TYPE_CHECKING:
+    from semantic2d_dataset.access.registry import OpenDataset
+    from semantic2d_dataset.scoring.predictions import PredictionsReader
+
+app = typer.Typer(
+    name="semantic2d",
+    help="Semantic labels for 2D lidar scans: convert, label, load, train, score.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
+_INTERRUPTED = 130
+_FORWARDED = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+
+def main() -> None:
+    """Run the command line: 0 done, 1 bad input, 2 wrong usage, 130 interrupted."""
+    debug = "--debug" in sys.argv
+    try:
+        app(args=[word for word in sys.argv[1:] if word != "--debug"])
+    except (Semantic2DError, OSError) as err:
+        if debug:
+            raise
+        sys.stderr.write(f"error: {_message(err)}\n")
+        sys.exit(1)
+    except ImportError as err:
+        if debug or err.name not in ("torch", "safetensors"):
+            raise
+        sys.stderr.write(
+            "error: this command needs PyTorch: pip install 'semantic2d-dataset[torch]'\n"
+        )
+        sys.exit(1)
+    except (KeyboardInterrupt, SystemExit) as end:
+        if isinstance(end, SystemExit) and end.code != _INTERRUPTED:
+            raise
+        sys.stderr.write("interrupted; nothing half done was left\n")
+        sys.exit(_INTERRUPTED)
+
+
+def _message(err: Exception) -> str:
+    if isinstance(err, OSError) and not isinstance(err, Semantic2DError) and err.filename:
+        return f"{err.filename}: {(err.strerror or str(err)).lower()}"
+    return str(err)
+
+
+def _print_version(wanted: bool) -> None:  # noqa: FBT001 - typer calls it
+    if wanted:
+        typer.echo(f"semantic2d-dataset {semantic2d_dataset.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show a traceback where there is an error.")
+    ] = False,
+) -> None:
+    """Take the options that stand before a command."""
+
+
+@app.command()
+def info(
+    path: Annotated[
+        str, typer.Argument(help="Sequence or predictions file, data set folder or name.")
+    ],
+    *,
+    as_json: AsJson = False,
+) -> None:
+    """Say what a file or a data set holds."""
+    from semantic2d_dataset.summaries import describe_dataset, describe_file, format_summary
+
+    file = Path(path)
+    said = describe_file(file) if file.is_file() else describe_dataset(_open(path))
+    typer.echo(json.dumps(said, indent=1) if as_json else format_summary(said))
+
+
+@app.command()
+def verify(
+    dataset: Annotated[str, typer.Argument(help="Data set folder or name.")],
+    *,
+    full: Annotated[bool, typer.Option("--full", help="Hash every byte, read it all.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check the files of a data set against its manifest."""
+    from semantic2d_dataset.format.manifest import find_problems
+
+    data = _open(dataset)
+    problems = [str(problem) for problem in find_problems(data.root, full=full)]
+    files = len(data.manifest.files)
+    if as_json:
+        typer.echo(json.dumps({"files": files, "full": full, "problems": problems}, indent=1))
+    else:
+        for problem in problems:
+            typer.echo(problem)
+        typer.echo(f"{data.root}: {files} files, {len(problems) or 'no'} problem(s)")
+    if problems:
+        raise typer.Exit(1)
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Folder to make.")],
+    *,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed gives other buildings.")] = 0,
+    environment: Annotated[
+        list[str] | None, typer.Option(help="Floor plans; all if not given.")
+    ] = None,
+    recordings: Annotated[int, typer.Option(min=1, help="Recordings in each.")] = 1,
+    scans: Annotated[int, typer.Option(min=1, help="Scans in each recording, at 20 Hz.")] = 340,
+    lidar: Annotated[list[str] | None, typer.Option(help="Lidars; all three if not given.")] = None,
+    name: Annotated[str, typer.Option(help="Name in the manifest.")] = "semantic2d-simulated",
+) -> None:
+    """Make a data set with exact truth, of any size."""
+    from semantic2d_dataset.format.manifest import check_names
+    from semantic2d_dataset.format.writing import make_folder
+    from semantic2d_dataset.scene.lidars import LIDARS, find_lidar
+    from semantic2d_dataset.simulation.mini import simulate_dataset
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InvalidInputError(f"{out}: exists already; choose a new folder")
+    lidars = [find_lidar(one).name for one in lidar or LIDARS]
+    check_names(name, "1.0.0")
+
+    def make(folder: Path) -> None:
+        simulate_dataset(
+            folder,
+            seed=seed,
+            environments=environment,
+            recordings=recordings,
+            scans=scans,
+            lidars=lidars,
+            name=name,
+        )
+
+    make_folder(out.resolve(), make, lambda: False)
+    typer.echo(f"made {out}; look at it with: semantic2d info {out}")
+
+
+@app.command()
+def score(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    *,
+    data: Annotated[
+        str | None, typer.Option(help="Data set folder or name; else as the file says.")
+    ] = None,
+    scheme: Annotated[str | None, typer.Option(help="Split scheme; else as it says.")] = None,
+    split: Annotated[str | None, typer.Option(help="Split; else as the file says.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score predictions: IoU and CA, by class and mean."""
+    from semantic2d_dataset.format.writing import write_text_atomically
+    from semantic2d_dataset.scoring import submission
+    from semantic2d_dataset.scoring.predictions import PredictionsReader
+
+    if out is not None:
+        _check_page(out, predictions)
+    with PredictionsReader(predictions) as reader:
+        name = _dataset_of(reader, data)
+    result = submission.score_predictions(predictions, _open(name), scheme=scheme, split=split)
+    text = submission.result_to_json(result)
+    if out is not None:
+        write_text_atomically(out, text)
+    typer.echo(text if as_json else submission.format_score(result))
+
+
+@app.command()
+def report(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    *,
+    data: Annotated[
+        str | None, typer.Option(help="Data set folder or name; else as the file says.")
+    ] = None,
+    scheme: Annotated[str | None, typer.Option(help="Split scheme; else as it says.")] = None,
+    split: Annotated[str | None, typer.Option(help="Split; else as the file says.")] = None,
+    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("report.html"),
+) -> None:
+    """Write an HTML page about predictions."""
+    from semantic2d_dataset.reports import write_report
+    from semantic2d_dataset.scoring.predictions import PredictionsReader
+
+    _check_page(out, predictions)
+    with PredictionsReader(predictions) as reader:
+        name = _dataset_of(reader, data)
+    write_report(out, predictions, _open(name), scheme=scheme, split=split)
+    typer.echo(f"wrote {out}")
+
+
+@app.command()
+def plot(
+    sequence: Annotated[Path, typer.Argument(help="Sequence file.")],
+    *,
+    scan: Annotated[int, typer.Option(min=0, help="Index of the scan.")] = 0,
+    out: Annotated[Path, typer.Option(help="Picture to write.")] = Path("scan.png"),
+) -> None:
+    """Draw one scan of a sequence over its map."""
+    from semantic2d_dataset.summaries import draw_scan
+
+    draw_scan(sequence, scan, out)
+    typer.echo(f"wrote {out}")
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
+def convert(context: typer.Context) -> None:
+    """Convert a recording (ROS 1 or ROS 2 bag) into a sequence."""
+    command = typer.Typer(add_completion=False, rich_markup_mode=None)
+    command.command(name="convert")(load_sibling("conversion").convert)
+    _forward(command, "convert", context.args)
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
+def salsa(context: typer.Context) -> None:
+    """Label a sequence from one annotated map."""
+    _forward(load_sibling("salsa").app, "salsa", context.args)
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
+def baseline(context: typer.Context) -> None:
+    """Train S3-Net, and predict with it."""
+    _forward(load_sibling("baselines").app, "baseline", context.args)
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
+def leaderboard(context: typer.Context) -> None:
+    """Rank results."""
+    _forward(load_sibling("leaderboard").app, "leaderboard", context.args)
+
+
+def load_sibling(package: str) -> ModuleType:
+    """Import the commands of a package that is installed beside this one.
+
+    Raises
+    ------
+    InvalidInputError
+        If another package of that name comes first on the import path.
+    """
+    expected = Path(semantic2d_dataset.__file__).resolve().parents[1] / package
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        raise InvalidInputError(
+            f"the package {package!r} of semantic2d-dataset is not there (expected at {expected}); "
+            "install semantic2d-dataset again"
+        )
+    origin = Path(spec.origin).resolve().parent if spec.origin else None
+    if origin != expected:
+        raise InvalidInputError(
+            f"the package {package!r} of semantic2d-dataset is {expected}, but Python finds "
+            f"{origin or 'another one'} first; run from another folder, rename or uninstall "
+            "that one, or take it off PYTHONPATH"
+        )
+    return importlib.import_module(f"{package}.cli")
+
+
+def _forward(command: typer.Typer, name: str, words: Sequence[str]) -> None:
+    status = typer.main.get_command(command).main(
+        args=list(words), prog_name=f"semantic2d {name}", standalone_mode=False
+    )
+    if status:
+        raise typer.Exit(status)
+
+
+def _open(name: str) -> OpenDataset:
+    from semantic2d_dataset.access.registry import open_dataset
+
+    return open_dataset(name)
+
+
+def _check_page(out: Path, source: Path) -> None:
+    """Refuse, before any work, an output that would replace the input or is a folder."""
+    if out.is_dir():
+        raise InvalidInputError(f"{out}: is a folder; give the name of a file")
+    if out.exists() and source.exists() and out.samefile(source):
+        raise InvalidInputError(f"{out}: is the input itself; choose another name")
+
+
+def _dataset_of(reader: PredictionsReader, given: str | None) -> str:
+    if not (given or reader.dataset):
+        raise InvalidInputError(f"{reader.path}: does not name its data set; say it with --data")
+    return given or reader.dataset
+
+
+if __name__ == "__main__":
+    main()

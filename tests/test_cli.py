@@ -1,0 +1,314 @@
+"""The command line: one clear message and the right exit status for whatever it is given."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from semantic2d_dataset import __version__, cli
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.format.manifest import read_manifest
+from tests.conftest import PROJECT
+from tests.generators import make_sequence
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run the command in this process; returns exit status, output and messages."""
+
+    def run_it(*words):
+        monkeypatch.setattr(sys, "argv", ["semantic2d", *map(str, words)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code or 0
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return run_it
+
+
+def test_version(run):
+    assert run("--version") == (0, f"semantic2d-dataset {__version__}\n", "")
+
+
+def test_help_lists_every_command(run):
+    status, out, _ = run("--help")
+    assert status == 0
+    for command in (
+        "info",
+        "verify",
+        "simulate",
+        "score",
+        "report",
+        "plot",
+        "convert",
+        "salsa",
+        "baseline",
+        "leaderboard",
+    ):
+        assert f"\n  {command} " in out
+
+
+@pytest.mark.parametrize(
+    "words", [["convert"], ["salsa", "label"], ["baseline", "train"], ["leaderboard", "table"]]
+)
+def test_commands_of_siblings_have_help(words, run):
+    status, out, _ = run(*words, "--help")
+    assert status == 0
+    assert f"Usage: semantic2d {' '.join(words)}" in out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["nothing"],
+        ["info"],
+        ["verify", "--nothing"],
+        ["simulate", "x", "--scans", "many"],
+        ["simulate", "x", "--scans", "0"],
+        ["simulate", "x", "--seed", "-1"],
+        ["convert"],
+        ["salsa", "nothing"],
+        ["salsa", "label"],
+        ["baseline", "train"],
+        ["leaderboard", "table"],
+    ],
+)
+def test_wrong_usage_exits_with_2(words, run):
+    status, _, err = run(*words)
+    assert status == 2
+    assert "Usage: semantic2d" in err
+
+
+@pytest.fixture
+def bad_files(tmp_path, dataset_folder):
+    """One file of each wrong kind."""
+    make_sequence(tmp_path / "good.h5", 10)
+    whole = (tmp_path / "good.h5").read_bytes()
+    (tmp_path / "truncated").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "empty").write_bytes(b"")
+    (tmp_path / "wrong-kind").write_text("hello")
+    (tmp_path / "folder").mkdir()
+    return tmp_path
+
+
+COMMANDS = {
+    "info": ["info", "{bad}"],
+    "verify": ["verify", "{bad}"],
+    "score": ["score", "{bad}"],
+    "report": ["report", "{bad}", "--out", "{out}"],
+    "plot": ["plot", "{bad}", "--out", "{out}.png"],
+    "convert": ["convert", "{bad}", "--out", "{out}"],
+    "salsa sequence": [
+        "salsa",
+        "label",
+        "{bad}",
+        "--map",
+        "{bad}",
+        "--annotation",
+        "{bad}",
+        "--out",
+        "{out}",
+    ],
+    "salsa map": [
+        "salsa",
+        "label",
+        "{good}",
+        "--map",
+        "{bad}",
+        "--annotation",
+        "{bad}",
+        "--out",
+        "{out}",
+    ],
+    "train": ["baseline", "train", "s3net", "--data", "{bad}", "--out", "{out}"],
+    "predict": ["baseline", "predict", "{bad}", "--out", "{out}"],
+    "leaderboard": ["leaderboard", "table", "{bad}"],
+}
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "truncated", "wrong-kind", "folder"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_bad_input_gives_one_message_and_exit_1(command, kind, run, bad_files):
+    places = {
+        "bad": bad_files / kind,
+        "good": bad_files / "good.h5",
+        "out": bad_files / "out",
+    }
+    before = sorted(bad_files.iterdir())
+    status, _, err = run(*(word.format(**places) for word in COMMANDS[command]))
+    assert status == 1
+    assert err.startswith("error: ")
+    assert kind in err.splitlines()[0]
+    assert "Traceback" not in err
+    assert sorted(bad_files.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["info", "semantic3d"], "known: semantic2d-mini"),
+        (["simulate", "{tmp}/new", "--lidar", "velodyne"], "unknown lidar 'velodyne'; known"),
+        (["simulate", "{tmp}/new", "--environment", "moon"], "unknown"),
+        (["simulate", "{tmp}"], "exists already; choose a new folder"),
+        (["simulate", "{tmp}/new", "--name", "My Data"], "such as 'my-data'"),
+        (["score", "{tmp}/good.h5", "--out", "{tmp}/good.h5"], "is the input itself"),
+        (["report", "{tmp}/good.h5", "--out", "{tmp}"], "is a folder"),
+        (["plot", "{tmp}/good.h5", "--scan", "10"], "has 10 scans, so none with index 10"),
+        (["plot", "{tmp}/good.h5", "--out", "{tmp}/x.doc"], "x.doc"),
+        (["baseline", "train", "s4net", "--out", "{tmp}/x"], "s4net"),
+        (["baseline", "train", "s3net", "--features", "XY", "--out", "{tmp}/x"], "unknown feat"),
+        (
+            ["baseline", "train", "s3net", "--data", "{data}", "--out", "{tmp}/x"],
+            "no sequence of the lidar 'hokuyo'; it has small",
+        ),
+        (
+            [
+                *("baseline", "train", "s3net", "--data", "{data}", "--lidar", "small"),
+                *("--scheme", "random", "--out", "{tmp}/x"),
+            ],
+            "unknown scheme 'random'; known are block, environment, frame",
+        ),
+    ],
+)
+def test_unknown_names_say_what_there_is(words, says, run, tmp_path, dataset_folder):
+    make_sequence(tmp_path / "good.h5", 10)
+    places = {"tmp": tmp_path, "data": dataset_folder}
+    status, _, err = run(*(word.format(**places) for word in words))
+    assert status == 1
+    assert says in err
+    assert [p.name for p in tmp_path.iterdir()] == ["good.h5"]
+
+
+def test_debug_shows_the_traceback(run):
+    with pytest.raises(FileNotFoundError):
+        run("info", "nothing", "--debug")
+
+
+def test_info_describes_a_sequence(run, tmp_path):
+    make_sequence(tmp_path / "a.h5", 10)
+    status, out, _ = run("info", tmp_path / "a.h5")
+    assert status == 0
+    assert "lobby--first--small" in out
+    assert "beams 37" in out
+    status, out, _ = run("info", tmp_path / "a.h5", "--json")
+    said = json.loads(out)
+    assert said["scans"] == 10
+    assert said["lidar"]["beams"] == 37
+    assert sum(said["class_shares"].values()) == pytest.approx(1)
+    assert len(said["content_digest"]) == 64
+
+
+def test_info_describes_a_data_set(run, dataset_folder):
+    status, out, _ = run("info", dataset_folder)
+    assert status == 0
+    assert "generated" in out
+    assert "frame train 315, val 45, test 90, none 0" in out
+    said = json.loads(run("info", dataset_folder, "--json")[1])
+    assert said["scans_by_lidar"] == {"small": 450}
+    assert said["splits"]["frame"] == {"train": 315, "val": 45, "test": 90, "none": 0}
+
+
+def test_verify_says_what_is_wrong_and_exits_1(run, dataset_folder, tmp_path):
+    copy = shutil.copytree(dataset_folder, tmp_path / "copy")
+    assert run("verify", copy, "--full")[0] == 0
+    victim = read_manifest(copy).sequences[0].file
+    (copy / victim).unlink()
+    status, out, _ = run("verify", copy)
+    assert status == 1
+    assert f"{victim}: missing" in out
+    status, out, _ = run("verify", copy, "--json")
+    assert status == 1
+    assert len(json.loads(out)["problems"]) == 1
+
+
+def test_plot_draws_a_scan_over_its_map(run, tmp_path):
+    make_sequence(tmp_path / "a.h5", 10)
+    assert run("plot", tmp_path / "a.h5", "--scan", "3", "--out", tmp_path / "a.png")[0] == 0
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_shadowing_package_is_named_with_a_way_out(tmp_path, monkeypatch):
+    (tmp_path / "conversion").mkdir()
+    (tmp_path / "conversion" / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "conversion", raising=False)
+    monkeypatch.delitem(sys.modules, "conversion.cli", raising=False)
+    with pytest.raises(InvalidInputError, match=f"Python finds {tmp_path}/conversion first"):
+        cli.load_sibling("conversion")
+
+
+def test_shadowing_does_not_stop_other_commands(tmp_path):
+    (tmp_path / "conversion.py").write_text("raise RuntimeError")
+    done = subprocess.run(
+        [sys.executable, "-m", "semantic2d_dataset.cli", "convert", "x"],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{PROJECT}"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: the package 'conversion' of semantic2d-dataset is")
+
+
+PREDICT = ["semantic2d", "baseline", "predict", "run", "--out", "p.h5"]
+WITHOUT_TORCH = "import sys; sys.modules['torch'] = None\n"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from semantic2d_dataset import load_dataset",
+        f"from semantic2d_dataset import cli\nsys.argv = {PREDICT}\ncli.main()",
+    ],
+)
+def test_missing_torch_is_told_with_the_way_to_get_it(code):
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH + code],
+        cwd=PROJECT,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert "pip install 'semantic2d-dataset[torch]'" in done.stderr.splitlines()[-1]
+
+
+INTERRUPTED = {
+    "own command": ["simulate", "{tmp}/out", "--scans", "3000"],
+    "forwarded command": [
+        *("baseline", "train", "s3net", "--data", "{data}", "--lidar", "small"),
+        *("--preset", "quick", "--epochs", "100000", "--minutes", "60", "--out", "{tmp}/out"),
+    ],
+}
+
+
+@pytest.mark.parametrize("command", INTERRUPTED)
+def test_interrupted_command_says_so_and_exits_with_130(command, tmp_path, dataset_folder):
+    words = [w.format(tmp=tmp_path, data=dataset_folder) for w in INTERRUPTED[command]]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "semantic2d_dataset.cli", *words],
+        cwd=PROJECT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    # Python itself ends by the signal where it hit code run from C; to a shell that is 130 too
+    assert process.returncode in (130, -signal.SIGINT)
+    assert err.splitlines()[-1].startswith("interrupted")
+    assert "Traceback" not in err
+    if command == "own command":
+        assert list(tmp_path.iterdir()) == []
