@@ -1,0 +1,1 @@
+"""Sequences and one labelled map to labelled sequences."""

@@ -1,0 +1,374 @@
+"""The numerical heart of the alignment: robust scan-to-map registration on a distance field.
+
+Poses are x, y, yaw in the frame of the grid (m, rad; the corner of cell (0, 0) is its origin), the
+distance field is (H, W) f4 in m at cell centres, points are (P, 2) f8 in m in the base frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic2d_dataset.scene.geometry import beam_directions, mount_in_plane
+from semantic2d_dataset.scene.scans import ScanBatch
+
+Float = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+FIRST_SCALE_M, LAST_SCALE_M = 0.5, 0.1  # finer than 0.1 m is worse where the world has changed
+SHRINK = 0.75  # of the scale, per iteration
+STRIDE = 4  # of the points, until these have settled at the last scale
+FINE_STEPS = 4  # at most, with all points
+MAX_STEPS = 30
+STEP_M, STEP_RAD = 5e-4, 1e-4  # smaller steps end the iteration
+
+SEARCH_STEPS = 4  # to either side, per axis
+SEARCH_M, SEARCH_RAD = 0.2, math.radians(2.75)  # step: 0.8 m and 11 degrees to either side
+SEARCH_POINTS = 80
+SEARCH_SCALE_M = 0.2
+CANDIDATES = 5
+HIGH_COST = 0.4  # of a refined pose, above which the neighbourhood is searched
+WORSE_COST = 0.02  # than the neighbour's, above which its pose is tried; noise moves a cost less
+
+Beams = tuple[NDArray[np.float32], NDArray[np.bool_], Float, Float]
+"""What the kernels take of N scans: ranges (N, B), which to use (N, B), directions (B, 2) of the
+beams in the base frame, and the lidar's place (2,) there."""
+
+
+def beams_of(batch: ScanBatch, use: NDArray[np.bool_]) -> Beams:
+    """Return what the kernels take, with the mount applied: p_base = R p_lidar + t."""
+    rotation, offset = mount_in_plane(batch.lidar.base_T_lidar)
+    return batch.ranges, use, beam_directions(batch.lidar.bearings) @ rotation.T, offset
+
+
+@numba.njit(cache=True)
+def base_points(
+    ranges: NDArray[np.float32], use: NDArray[np.bool_], directions: Float, offset: Float
+) -> Float:
+    """Return the endpoints (P, 2) in the base frame of the beams to use."""
+    points = np.empty((len(ranges), 2))
+    count = 0
+    for k in range(len(ranges)):
+        if use[k]:
+            r = np.float64(ranges[k])
+            points[count, 0] = offset[0] + r * directions[k, 0]
+            points[count, 1] = offset[1] + r * directions[k, 1]
+            count += 1
+    return points[:count]
+
+
+@numba.njit(cache=True)
+def robust_cost(
+    points: Float, stride: int, pose: Float, field: Field, resolution: float, scale: float
+) -> float:
+    """Return the mean Geman-McClure cost 0..1 of the points; outside the map a point costs 1."""
+    c, s = math.cos(pose[2]) / resolution, math.sin(pose[2]) / resolution
+    x0, y0 = pose[0] / resolution, pose[1] / resolution
+    rows, columns = field.shape
+    total, count = 0.0, 0
+    for k in range(0, len(points), stride):
+        column = math.floor(x0 + c * points[k, 0] - s * points[k, 1])
+        row = math.floor(y0 + s * points[k, 0] + c * points[k, 1])
+        count += 1
+        if 0 <= row < rows and 0 <= column < columns:
+            d2 = np.float64(field[row, column]) ** 2
+            total += d2 / (d2 + scale * scale)
+        else:
+            total += 1.0
+    return total / max(count, 1)
+
+
+@numba.njit(cache=True)
+def normal_equations(
+    points: Float, stride: int, pose: Float, field: Field, resolution: float, scale: float
+) -> tuple[Float, Float, float, float]:
+    """Linearise the weighted distances at a pose.
+
+    Returns
+    -------
+    hessian, gradient, weighted_squares, weights
+        (3, 3), (3,), sum of w d^2, sum of w, with Geman-McClure weights w. Points beyond the map
+        take no part.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    rows, columns = field.shape
+    hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+    squares, weights = 0.0, 0.0
+    h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(0, len(points), stride):
+        dx = cos * points[k, 0] - sin * points[k, 1]
+        dy = sin * points[k, 0] + cos * points[k, 1]
+        u = (pose[0] + dx) / resolution - 0.5
+        v = (pose[1] + dy) / resolution - 0.5
+        column, row = math.floor(u), math.floor(v)
+        if not (0 <= row < rows - 1 and 0 <= column < columns - 1):
+            continue
+        fu, fv = u - column, v - row
+        d00, d01 = field[row, column], field[row, column + 1]
+        d10, d11 = field[row + 1, column], field[row + 1, column + 1]
+        d = (1 - fv) * ((1 - fu) * d00 + fu * d01) + fv * ((1 - fu) * d10 + fu * d11)
+        gx = ((1 - fv) * (d01 - d00) + fv * (d11 - d10)) / resolution
+        gy = ((1 - fu) * (d10 - d00) + fu * (d11 - d01)) / resolution
+        gt = gy * dx - gx * dy
+        w = (scale * scale / (scale * scale + d * d)) ** 2
+        h00, h01, h02 = h00 + w * gx * gx, h01 + w * gx * gy, h02 + w * gx * gt
+        h11, h12, h22 = h11 + w * gy * gy, h12 + w * gy * gt, h22 + w * gt * gt
+        gradient[0] += w * d * gx
+        gradient[1] += w * d * gy
+        gradient[2] += w * d * gt
+        squares += w * d * d
+        weights += w
+    hessian[0, 0], hessian[1, 1], hessian[2, 2] = h00, h11, h22
+    hessian[0, 1], hessian[0, 2], hessian[1, 2] = h01, h02, h12
+    hessian[1, 0], hessian[2, 0], hessian[2, 1] = h01, h02, h12
+    return hessian, gradient, squares, weights
+
+
+@numba.njit(cache=True)
+def refine(
+    points: Float, start: Float, field: Field, resolution: float, first_scale: float
+) -> Float:
+    """Move a pose so that the points lie on the map: Gauss-Newton with a shrinking robust scale."""
+    pose, scale, fine = start.copy(), first_scale, 0
+    for _ in range(MAX_STEPS):
+        stride = STRIDE if fine == 0 else 1
+        h, g, _squares, weights = normal_equations(points, stride, pose, field, resolution, scale)
+        step = solve(h, g, 1e-3 * weights + 1e-9)
+        pose -= step
+        if scale <= LAST_SCALE_M:
+            done = abs(step[0]) < STEP_M and abs(step[1]) < STEP_M and abs(step[2]) < STEP_RAD
+            if fine == FINE_STEPS or (done and fine > 0):
+                break
+            fine += done or fine > 0
+        scale = max(scale * SHRINK, LAST_SCALE_M)
+    return pose
+
+
+@numba.njit(cache=True)
+def solve(h: Float, g: Float, damping: float) -> Float:
+    """Solve (h + damping I) x = g, h symmetric (3, 3), by Cholesky's factors."""
+    l00 = math.sqrt(h[0, 0] + damping)
+    l10, l20 = h[1, 0] / l00, h[2, 0] / l00
+    l11 = math.sqrt(max(h[1, 1] + damping - l10 * l10, 1e-12))
+    l21 = (h[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(max(h[2, 2] + damping - l20 * l20 - l21 * l21, 1e-12))
+    y0 = g[0] / l00
+    y1 = (g[1] - l10 * y0) / l11
+    y2 = (g[2] - l20 * y0 - l21 * y1) / l22
+    x = np.empty(3)
+    x[2] = y2 / l22
+    x[1] = (y1 - l21 * x[2]) / l11
+    x[0] = (y0 - l10 * x[1] - l20 * x[2]) / l00
+    return x
+
+
+@numba.njit(cache=True)
+def search(points: Float, centre: Float, field: Field, resolution: float) -> Float:
+    """Score a lattice of poses around a centre, refine the best few and return the best of them."""
+    stride = max(len(points) // SEARCH_POINTS, 1)
+    best_costs = np.full(CANDIDATES, np.inf)
+    best_poses = np.zeros((CANDIDATES, 3))
+    pose = np.empty(3)
+    for i in range(-SEARCH_STEPS, SEARCH_STEPS + 1):
+        for j in range(-SEARCH_STEPS, SEARCH_STEPS + 1):
+            for k in range(-SEARCH_STEPS, SEARCH_STEPS + 1):
+                pose[0] = centre[0] + i * SEARCH_M
+                pose[1] = centre[1] + j * SEARCH_M
+                pose[2] = centre[2] + k * SEARCH_RAD
+                cost = robust_cost(points, stride, pose, field, resolution, SEARCH_SCALE_M)
+                worst = np.argmax(best_costs)
+                if cost < best_costs[worst]:
+                    best_costs[worst] = cost
+                    best_poses[worst] = pose
+    best, lowest = centre.copy(), np.inf
+    for m in range(CANDIDATES):
+        pose = refine(points, best_poses[m], field, resolution, FIRST_SCALE_M / 2)
+        cost = robust_cost(points, 1, pose, field, resolution, LAST_SCALE_M)
+        if cost < lowest:
+            best, lowest = pose, cost
+    return best
+
+
+@numba.njit(cache=True, parallel=True)
+def register_each(
+    ranges: NDArray[np.float32],
+    use: NDArray[np.bool_],
+    directions: Float,
+    offset: Float,
+    starts: Float,
+    field: Field,
+    resolution: float,
+    poses: Float,
+    costs: Float,
+) -> None:
+    """Refine every scan from its own start (N, 3); search where the cost stays high."""
+    for n in numba.prange(ranges.shape[0]):
+        points = base_points(ranges[n], use[n], directions, offset)
+        costs[n] = register_one(points, starts[n], field, resolution, poses[n])
+
+
+@numba.njit(cache=True)
+def register_one(points: Float, start: Float, field: Field, resolution: float, out: Float) -> float:
+    """Write the refined pose into `out` and return its cost, infinity where nothing was done."""
+    if len(points) == 0 or not np.isfinite(start).all():
+        return np.inf
+    pose, cost = register(points, start, field, resolution)
+    out[:] = pose
+    return cost
+
+
+@numba.njit(cache=True)
+def register(points: Float, start: Float, field: Field, resolution: float) -> tuple[Float, float]:
+    """Refine a start, and search around it where the cost stays high."""
+    pose = refine(points, start, field, resolution, FIRST_SCALE_M)
+    cost = robust_cost(points, 1, pose, field, resolution, LAST_SCALE_M)
+    if cost > HIGH_COST:
+        other = search(points, start, field, resolution)
+        other_cost = robust_cost(points, 1, other, field, resolution, LAST_SCALE_M)
+        if other_cost < cost:
+            return other, other_cost
+    return pose, cost
+
+
+@numba.njit(cache=True)
+def chain(
+    ranges: NDArray[np.float32],
+    use: NDArray[np.bool_],
+    directions: Float,
+    offset: Float,
+    starts: Float,
+    order: NDArray[np.int64],
+    before: Float,
+    field: Field,
+    resolution: float,
+    poses: Float,
+    costs: Float,
+) -> None:
+    """Where a neighbour fits better, try its pose, moved as the starts moved, as another start.
+
+    Starts that drift away still move rightly from scan to scan, so that one good pose pulls those
+    after it in. `order` (N,) says which scan follows which, `before` (2, 3) are pose and start of
+    a trusted scan before the first (NaN where there is none); a cost of infinity marks a scan
+    that is not aligned.
+    """
+    pose, start = before[0], before[1]
+    cost = -np.inf if np.isfinite(before).all() else np.inf
+    for n in order:
+        if not costs[n] < np.inf:
+            continue
+        if costs[n] > cost + WORSE_COST:
+            points = base_points(ranges[n], use[n], directions, offset)
+            other, other_cost = register(points, carry(pose, start, starts[n]), field, resolution)
+            if other_cost < costs[n]:
+                poses[n], costs[n] = other, other_cost
+        pose, start, cost = poses[n], starts[n], costs[n]
+
+
+@numba.njit(cache=True)
+def carry(pose: Float, start: Float, next_start: Float) -> Float:
+    """Move a pose as its start moved: pose * start^-1 * next_start."""
+    turn = pose[2] - start[2]
+    c, s = math.cos(turn), math.sin(turn)
+    dx, dy = next_start[0] - start[0], next_start[1] - start[1]
+    moved = np.empty(3)
+    moved[0] = pose[0] + c * dx - s * dy
+    moved[1] = pose[1] + s * dx + c * dy
+    moved[2] = next_start[2] + turn
+    return moved
+
+
+@numba.njit(cache=True, parallel=True)
+def fit_each(
+    ranges: NDArray[np.float32],
+    use: NDArray[np.bool_],
+    directions: Float,
+    offset: Float,
+    poses: Float,
+    field: Field,
+    resolution: float,
+    inlier_m: float,
+    residual_m: NDArray[np.float32],
+    inlier_ratio: NDArray[np.float32],
+) -> None:
+    """Say how every scan fits: rms distance of its inliers, and their share."""
+    for n in numba.prange(ranges.shape[0]):
+        points = base_points(ranges[n], use[n], directions, offset)
+        if len(points) > 0 and np.isfinite(poses[n, 0]):
+            quality = fit_quality(points, poses[n], field, resolution, inlier_m)
+            residual_m[n], inlier_ratio[n] = quality
+
+
+@numba.njit(cache=True, parallel=True)
+def covariance_each(
+    ranges: NDArray[np.float32],
+    use: NDArray[np.bool_],
+    directions: Float,
+    offset: Float,
+    poses: Float,
+    field: Field,
+    resolution: float,
+    covariance: Float,
+) -> None:
+    """Write the covariance (3, 3) of every pose that is known."""
+    for n in numba.prange(ranges.shape[0]):
+        points = base_points(ranges[n], use[n], directions, offset)
+        if len(points) > 0 and np.isfinite(poses[n, 0]):
+            pose_covariance(points, poses[n], field, resolution, covariance[n])
+
+
+@numba.njit(cache=True)
+def distance_at(u: float, v: float, field: Field) -> float:
+    """Interpolate the field bilinearly at column u, row v (cell centres); infinity beyond it."""
+    column, row = math.floor(u), math.floor(v)
+    if not (0 <= row < field.shape[0] - 1 and 0 <= column < field.shape[1] - 1):
+        return math.inf
+    fu, fv = u - column, v - row
+    below = (1 - fu) * field[row, column] + fu * field[row, column + 1]
+    above = (1 - fu) * field[row + 1, column] + fu * field[row + 1, column + 1]
+    distance: float = (1 - fv) * below + fv * above
+    return distance
+
+
+@numba.njit(cache=True)
+def fit_quality(
+    points: Float, pose: Float, field: Field, resolution: float, inlier_m: float
+) -> tuple[float, float]:
+    """Return the rms distance of the points within `inlier_m` of the map (m), and their share."""
+    c, s = math.cos(pose[2]) / resolution, math.sin(pose[2]) / resolution
+    u0, v0 = pose[0] / resolution - 0.5, pose[1] / resolution - 0.5
+    squares, count = 0.0, 0
+    for k in range(len(points)):
+        u = u0 + c * points[k, 0] - s * points[k, 1]
+        distance = distance_at(u, v0 + s * points[k, 0] + c * points[k, 1], field)
+        if distance <= inlier_m:
+            squares += distance * distance
+            count += 1
+    if count == 0:
+        return math.inf, 0.0
+    return math.sqrt(squares / count), count / len(points)
+
+
+@numba.njit(cache=True)
+def pose_covariance(
+    points: Float, pose: Float, field: Field, resolution: float, out: Float
+) -> None:
+    """Write the covariance (3, 3) of a pose, from the normal equations at the last scale.
+
+    The variance of a distance is that of the weighted residuals, and never below that of a point
+    spread evenly over one cell.
+    """
+    h, _g, squares, weights = normal_equations(points, 1, pose, field, resolution, LAST_SCALE_M)
+    variance = max(squares / max(weights, 1e-9), resolution * resolution / 12.0)
+    unit = np.zeros(3)
+    for k in range(3):
+        unit[:] = 0.0
+        unit[k] = variance
+        column = solve(h, unit, 1e-6)
+        for m in range(3):
+            out[m, k] = column[m]
+    for k in range(3):  # exactly symmetric, whatever was rounded
+        for m in range(k):
+            out[k, m] = out[m, k] = (out[k, m] + out[m, k]) / 2.0

@@ -1,0 +1,174 @@
+import hashlib
+
+import numpy as np
+import pytest
+
+from salsa import sequences
+from salsa.sequences import label_sequence
+from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
+from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
+from semantic2d_dataset.scene.taxonomy import UNLABELLED
+from tests.salsa import rooms
+
+SCANS = 70
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Map, annotation and a sequence of scans with rough poses, one of them unknown."""
+    folder = tmp_path_factory.mktemp("room")
+    truth = rooms.true_poses(SCANS)
+    rough = rooms.rough_poses(truth)
+    rough[5] = np.nan
+    write_source(folder / "source.h5", rooms.batch_at(truth, rough))
+    return folder, *rooms.write_room(folder)
+
+
+def write_source(path, batch):
+    header = SequenceHeader("room", "test", rooms.LIDAR, provenance={"made": "here"})
+    intensities = np.abs(batch.ranges, dtype=np.float32)
+    with SequenceWriter(path, header) as writer:
+        writer.append(
+            {
+                "scans/ranges": batch.ranges,
+                "scans/intensities": intensities,
+                "scans/stamps_ns": batch.stamps_ns,
+                "poses/initial": batch.poses,
+                "commands/velocity": np.zeros((len(batch), 2)),
+                "streams/imu/stamps_ns": np.arange(900),
+                "streams/imu/data": np.arange(1800.0).reshape(900, 2),
+            }
+        )
+
+
+@pytest.fixture(scope="module")
+def labelled(room):
+    folder, map_yaml, annotation = room
+    out = folder / "labelled.h5"
+    return out, label_sequence(folder / "source.h5", map_yaml, annotation, out)
+
+
+def test_a_labelled_sequence_holds_every_step_and_its_map(labelled):
+    out, summary = labelled
+    with SequenceReader(out) as reader:
+        truth = rooms.true_poses(SCANS)
+        metres, _ = rooms.errors(reader.read("poses/refined"), truth)
+        labels, accepted = reader.read("scans/labels"), reader.read("alignment/accepted")
+        assert np.nanmedian(metres) < 0.02
+        assert accepted.sum() == SCANS - 1 == summary.scans_accepted
+        assert (labels[5] == UNLABELLED).all()
+        assert (np.delete(labels, 5, axis=0) != UNLABELLED).all()
+        assert reader.read("alignment/covariance").shape == (SCANS, 3, 3)
+        offsets, segments = reader.read("lines/offsets"), reader.read("lines/segments")
+        assert (np.diff(offsets) >= 4).all()
+        assert offsets[-1] == len(segments)
+        np.testing.assert_array_equal(reader.read_map().occupancy, rooms.room_map().occupancy)
+    assert summary.near_after > 0.95 > summary.near_before
+    assert summary.points["Wall"] > 1000
+    assert summary.points["unlabelled"] == rooms.LIDAR.beams
+
+
+def test_what_the_source_held_is_kept(room, labelled):
+    folder, *_ = room
+    with SequenceReader(folder / "source.h5") as source, SequenceReader(labelled[0]) as copy:
+        for name in set(source.names) - {"provenance"}:
+            np.testing.assert_array_equal(copy.read(name), source.read(name))
+        assert copy.header.sequence_id == source.header.sequence_id
+
+
+def test_the_provenance_names_inputs_by_their_digest(room, labelled):
+    folder, map_yaml, annotation = room
+    with SequenceReader(labelled[0]) as reader:
+        provenance = reader.header.provenance
+    said = provenance["salsa"]["inputs"]
+    files = {"sequence": folder / "source.h5", "map": map_yaml, "annotation": annotation}
+    for role, path in files.items():
+        assert said[role]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert said["map_image"]["name"] == "room.pgm"
+    assert provenance["made"] == "here"
+    assert provenance["salsa"]["parameters"]["lines"]["min_line_points"] == 15
+
+
+def test_blocks_change_no_line_and_no_label(room, labelled, monkeypatch):
+    folder, map_yaml, annotation = room
+    monkeypatch.setattr(sequences, "BLOCK_SCANS", 64)
+    out = folder / "blocks.h5"
+    label_sequence(folder / "source.h5", map_yaml, annotation, out)
+    with SequenceReader(out) as blocks, SequenceReader(labelled[0]) as whole:
+        assert blocks.content_digest() == whole.content_digest()
+
+
+def test_labelling_twice_gives_the_same(room, labelled):
+    folder, map_yaml, annotation = room
+    out = folder / "again.h5"
+    label_sequence(labelled[0], map_yaml, annotation, out)
+    with SequenceReader(out) as again, SequenceReader(labelled[0]) as first:
+        assert again.content_digest() == first.content_digest()
+
+
+def test_an_existing_file_is_replaced_only_by_force(room, tmp_path):
+    folder, map_yaml, annotation = room
+    out = tmp_path / "out.h5"
+    out.write_bytes(b"mine")
+    with pytest.raises(
+        InvalidInputError, match="exists already; choose another name or use --force"
+    ):
+        label_sequence(folder / "none.h5", map_yaml, annotation, out)
+    assert out.read_bytes() == b"mine"
+    label_sequence(folder / "source.h5", map_yaml, annotation, out, force=True)
+    with SequenceReader(out) as reader:
+        assert "scans/labels" in reader
+    with pytest.raises(InvalidInputError, match="is an input itself"):
+        label_sequence(out, map_yaml, annotation, out, force=True)
+    with pytest.raises(WriteError, match="the folder .* does not exist"):
+        label_sequence(out, map_yaml, annotation, tmp_path / "none" / "out.h5")
+
+
+def test_scans_of_another_place_are_an_error_and_leave_nothing(room, tmp_path):
+    _, map_yaml, annotation = room
+    batch = rooms.batch_at(rooms.true_poses(8), rooms.true_poses(8))
+    batch.ranges[:] = np.random.default_rng(0).uniform(0.3, 3.0, batch.ranges.shape)
+    write_source(tmp_path / "source.h5", batch)
+    with pytest.raises(AlignmentError, match="do not fit the map: 0 of 8 scans accepted"):
+        label_sequence(tmp_path / "source.h5", map_yaml, annotation, tmp_path / "out.h5")
+    assert [path.name for path in tmp_path.iterdir()] == ["source.h5"]
+
+
+def test_a_sequence_without_poses_is_an_error(room, tmp_path):
+    _, map_yaml, annotation = room
+    truth = rooms.true_poses(3)
+    write_source(tmp_path / "source.h5", rooms.batch_at(truth, np.full((3, 3), np.nan)))
+    with pytest.raises(AlignmentError, match="no scan has a pose"):
+        label_sequence(tmp_path / "source.h5", map_yaml, annotation, tmp_path / "out.h5")
+
+
+def test_no_input_and_no_folder_is_ever_replaced(room, tmp_path):
+    folder, map_yaml, annotation = room
+    source = folder / "source.h5"
+    inputs = (source, map_yaml, folder / "room.pgm", annotation)
+    before = [path.read_bytes() for path in inputs]
+    for out in inputs:
+        with pytest.raises(InvalidInputError, match="is an input itself"):
+            label_sequence(source, map_yaml, annotation, out, force=True)
+    with pytest.raises(InvalidInputError, match="is a folder"):
+        label_sequence(source, map_yaml, annotation, tmp_path, force=True)
+    assert [path.read_bytes() for path in inputs] == before
+
+
+def test_blocks_outside_the_map_are_left_unlabelled_but_not_all_may_be(room, tmp_path, monkeypatch):
+    _, map_yaml, annotation = room
+    truth = rooms.true_poses(8)
+    rough = truth + np.where(np.arange(8) < 4, 0.0, 500.0)[:, None] * (1, 0, 0)
+    write_source(tmp_path / "half.h5", rooms.batch_at(truth, rough))
+    monkeypatch.setattr(sequences, "BLOCK_SCANS", 4)
+    summary = label_sequence(tmp_path / "half.h5", map_yaml, annotation, tmp_path / "out.h5")
+    assert (summary.scans_with_pose, summary.scans_accepted) == (8, 4)
+    write_source(tmp_path / "none.h5", rooms.batch_at(truth, truth + 500.0))
+    with pytest.raises(AlignmentError, match="all 8 poses lie outside the map"):
+        label_sequence(tmp_path / "none.h5", map_yaml, annotation, tmp_path / "no.h5")
+
+
+def test_hits_are_counted_only_for_those_who_ask(room, tmp_path, monkeypatch):
+    folder, map_yaml, annotation = room
+    monkeypatch.setattr(sequences, "HitCounter", None)
+    label_sequence(folder / "source.h5", map_yaml, annotation, tmp_path / "out.h5")
