@@ -1,0 +1,1 @@
+"""Labelled sequences to trained models and predictions."""

@@ -1,0 +1,249 @@
+"""Trained models on disk: safetensors weights, and a JSON file beside them that says what they are.
+
+The JSON file names its weights with their SHA-256 and replaces its predecessor in one step, so
+that a kill at any moment leaves the old pair or the new one. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from baselines.s3net import S3Net
+from semantic2d_dataset.access.features import Statistics, channel_count
+from semantic2d_dataset.errors import (
+    CorruptFileError,
+    DatasetNotFoundError,
+    FormatVersionError,
+    InvalidInputError,
+    WriteError,
+)
+from semantic2d_dataset.format.schema import FORMAT_MAJOR, FORMAT_VERSION
+from semantic2d_dataset.format.writing import partial_name, write_text_atomically
+from semantic2d_dataset.scene.lidars import LidarSpec
+from semantic2d_dataset.scene.taxonomy import Taxonomy
+
+_KIND = "semantic2d-checkpoint"
+_MODEL = "model"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A network, and what is needed to use it on scans.
+
+    Parameters
+    ----------
+    network
+        The trained network.
+    features
+        Letters of its input channels, in the order R, I, P, A.
+    statistics
+        What standardises them.
+    lidar
+        The sensor of the scans that it was trained on.
+    taxonomy
+        Its classes.
+    dataset
+        Where the scans came from: name, version, scheme; empty where not known.
+    training
+        The settings of the training, and what it reached.
+    """
+
+    network: S3Net
+    features: str
+    statistics: Statistics
+    lidar: LidarSpec
+    taxonomy: Taxonomy
+    dataset: Mapping[str, str] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+
+def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint into a folder, replacing the one that is there.
+
+    Raises
+    ------
+    WriteError
+        If the folder is missing or the disk is full; the old checkpoint is then untouched.
+    """
+    network = checkpoint.network
+    architecture = {"name": "s3net", "channels": network.channels, "classes": network.classes}
+    parts = ("statistics", "lidar", "taxonomy")
+    said = {
+        "architecture": architecture,
+        "features": checkpoint.features,
+        **{part: asdict(getattr(checkpoint, part)) for part in parts},
+        "dataset": dict(checkpoint.dataset),
+        "training": dict(checkpoint.training),
+    }
+    write_state(folder, _MODEL, said, network.state_dict())
+
+
+def load_checkpoint(folder: Path, *, device: str | torch.device = "cpu") -> Checkpoint:
+    """Read a checkpoint, its network in evaluation mode.
+
+    Parameters
+    ----------
+    folder
+        Where training left it.
+    device
+        Where to put the network.
+
+    Raises
+    ------
+    DatasetNotFoundError
+        If the folder holds no checkpoint.
+    CorruptFileError
+        If it is damaged, or its parts do not fit each other.
+    FormatVersionError
+        If it was written in a newer major format.
+    """
+    said, tensors = read_state(folder, _MODEL)
+    path = Path(folder) / f"{_MODEL}.json"
+    try:
+        checkpoint = _understand(said)
+        checkpoint.network.load_state_dict(tensors, strict=True)
+    except (KeyError, TypeError, ValueError, AttributeError) as err:
+        raise CorruptFileError(f"{path}: not the description of a model: {err!r}") from err
+    except RuntimeError as err:
+        raise CorruptFileError(f"{path}: the weights are of another architecture: {err}") from err
+    checkpoint.network.to(device).eval()
+    return checkpoint
+
+
+def has_state(folder: Path, stem: str = _MODEL) -> bool:
+    """Tell whether a folder holds a checkpoint, or another state by its stem."""
+    return (Path(folder) / f"{stem}.json").exists()
+
+
+def write_state(
+    folder: Path, stem: str, said: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> None:
+    """Write ``<stem>-<digest>.safetensors``, and ``<stem>.json`` with what is said of it.
+
+    Raises
+    ------
+    WriteError
+        If the folder is missing or the disk is full.
+    """
+    folder = Path(folder)
+    content = safetensors.torch.save({name: t.contiguous().cpu() for name, t in tensors.items()})
+    digest = hashlib.sha256(content).hexdigest()
+    weights = folder / f"{stem}-{digest[:16]}.safetensors"
+    _write_bytes(weights, content)
+    about = {"file": weights.name, "bytes": len(content), "sha256": digest}
+    head = {"format": _KIND, "format_version": FORMAT_VERSION}
+    write_text_atomically(
+        folder / f"{stem}.json", json.dumps(head | dict(said) | {"weights": about}, indent=2) + "\n"
+    )
+    for old in folder.glob(f"{stem}-*.safetensors"):
+        if old != weights:
+            old.unlink(missing_ok=True)
+
+
+def read_state(folder: Path, stem: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read what `write_state` wrote, and check every byte of the tensors.
+
+    Raises
+    ------
+    DatasetNotFoundError
+        If it is not there.
+    CorruptFileError, FormatVersionError
+        If it is damaged, or of a newer major format.
+    """
+    path = Path(folder) / f"{stem}.json"
+    if not path.is_file():
+        raise DatasetNotFoundError(f"{folder}: no trained model here (there is no {path.name})")
+    said = _read_json(path)
+    try:
+        about = said["weights"]
+        name, size, digest = str(about["file"]), int(about["bytes"]), str(about["sha256"])
+    except (KeyError, TypeError, ValueError) as err:
+        raise CorruptFileError(f"{path}: does not say which weights belong to it") from err
+    if Path(name).name != name or not name.endswith(".safetensors"):
+        raise CorruptFileError(f"{path}: expected weights in a .safetensors file here: {name!r}")
+    return said, _read_tensors(path.parent / name, size, digest)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as err:
+        raise CorruptFileError(f"{path}: not a JSON file: {err}") from err
+    if not isinstance(said, dict) or said.get("format") != _KIND:
+        raise CorruptFileError(f"{path}: expected a JSON object with format {_KIND!r}")
+    version = str(said.get("format_version", ""))
+    major = version.split(".", maxsplit=1)[0]
+    if not major.isdigit():
+        raise CorruptFileError(f"{path}: expected a format version, found {version!r}")
+    if int(major) > FORMAT_MAJOR:
+        raise FormatVersionError(
+            f"{path}: written in format {version}, and this package reads up to "
+            f"{FORMAT_MAJOR}.x; install semantic2d-dataset {major}.0 or later"
+        )
+    return said
+
+
+def _read_tensors(path: Path, size: int, digest: str) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise CorruptFileError(f"{path}: missing, though the model beside it names it")
+    found = path.stat().st_size
+    if found != size:
+        raise CorruptFileError(f"{path}: expected {size} bytes, found {found}; train again")
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise CorruptFileError(f"{path}: differs from its recorded SHA-256; train again")
+    try:
+        return safetensors.torch.load(content)
+    except (safetensors.SafetensorError, ValueError) as err:
+        raise CorruptFileError(f"{path}: not a safetensors file: {err}") from err
+
+
+def _understand(said: Mapping[str, Any]) -> Checkpoint:
+    """Build what a JSON file describes; the network has no weights yet."""
+    architecture, features = said["architecture"], said["features"]
+    if architecture["name"] != "s3net":
+        raise InvalidInputError(f"unknown architecture {architecture['name']!r}; known is s3net")
+    if channel_count(features) != architecture["channels"]:
+        raise InvalidInputError(f"features {features} are not {architecture['channels']} channels")
+    taxonomy = said["taxonomy"]
+    names, colours = taxonomy["names"], tuple(tuple(colour) for colour in taxonomy["colours"])
+    if len(names) != architecture["classes"]:
+        raise InvalidInputError(f"{len(names)} names for {architecture['classes']} classes")
+    statistics = {key: tuple(values) for key, values in said["statistics"].items()}
+    lidar = said["lidar"] | {"base_T_lidar": tuple(said["lidar"]["base_T_lidar"])}
+    return Checkpoint(
+        S3Net(architecture["channels"], architecture["classes"]),
+        features,
+        Statistics(**statistics),
+        LidarSpec(**lidar),
+        Taxonomy(tuple(names), colours, taxonomy["background_id"]),
+        dict(said["dataset"]),
+        dict(said["training"]),
+    )
+
+
+def _write_bytes(path: Path, content: bytes) -> None:
+    partial = partial_name(path)
+    try:
+        with partial.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except OSError as err:
+        raise WriteError(f"{path}: could not be written: {err}") from err
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink()

@@ -1,0 +1,169 @@
+"""The commands ``semantic2d baseline train`` and ``semantic2d baseline predict``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from semantic2d_dataset.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from baselines.configs import TrainingConfig
+
+app = typer.Typer(
+    help="Train models on labelled scans, and predict with them.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+_MODELS = ("s3net",)
+
+Data = Annotated[str, typer.Option("--data", help="Name of a data set, or its folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print what was done as JSON.")]
+Device = Annotated[
+    str | None, typer.Option(help="cpu or cuda; cuda where there is one, if not given.")
+]
+
+
+@app.command()
+def train(
+    model: Annotated[str, typer.Argument(help="What to train: s3net.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the model and its log.")],
+    data: Data = "semantic2d-mini",
+    lidar: Annotated[str, typer.Option(help="Whose scans to train on.")] = "hokuyo",
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    preset: Annotated[str, typer.Option(help="Settings to start from: quick or paper.")] = "paper",
+    features: Annotated[str | None, typer.Option(help="Letters of R, I, P, A.")] = None,
+    epochs: Annotated[int | None, typer.Option(help="Passes over the training split.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop after so many minutes.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of weights, order and latents.")] = None,
+    device: Device = None,
+    *,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where --out stopped.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the model in --out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Train a model, and keep the epoch that does best on the validation split."""
+    _check_model(model)
+    _check_free(out / "model.json", force=force or resume)
+    config = _config(
+        preset,
+        features=features,
+        epochs=epochs,
+        time_limit_s=None if minutes is None else 60 * minutes,
+        seed=seed,
+    )
+    from baselines import training
+    from semantic2d_dataset.access.torch_datasets import load_dataset
+
+    train_part, val_part = (
+        load_dataset(data, lidar=lidar, split=split, scheme=scheme, features=config.features)
+        for split in ("train", "val")
+    )
+    manifest = train_part.source.data.manifest
+    result = training.train(
+        config,
+        train_part,
+        val_part,
+        out,
+        device=_device(device),
+        resume=resume,
+        about={"name": manifest.name, "version": manifest.version, "scheme": scheme},
+    )
+    said = {
+        "model": str(out),
+        "best_epoch": result.best_epoch,
+        "val_mIoU": result.best_miou,
+        "epochs": result.epochs,
+        "seconds": round(result.seconds, 1),
+    }
+    _report(
+        said,
+        f"{out}: validation mIoU {100 * result.best_miou:.2f} % after epoch {result.best_epoch} "
+        f"of {result.epochs} ({result.seconds:.0f} s)",
+        as_json=as_json,
+    )
+
+
+@app.command()
+def predict(
+    run: Annotated[Path, typer.Argument(help="Folder that training left.")],
+    out: Annotated[Path, typer.Option("--out", help="Predictions file to write.")],
+    data: Data = "semantic2d-mini",
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    lidar: Annotated[
+        str | None, typer.Option(help="Whose scans to label; those of training, if not given.")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="Latents drawn for each scan.")] = 32,
+    seed: Annotated[int, typer.Option(help="Of the latents.")] = 0,
+    device: Device = None,
+    *,
+    probabilities: Annotated[
+        bool, typer.Option("--probabilities", help="Write class probabilities too.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file --out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Label the scans of a split by the majority of many samples."""
+    _check_free(out, force=force)
+    from baselines import inference
+    from baselines.checkpoints import load_checkpoint
+    from semantic2d_dataset.access.torch_datasets import load_dataset
+
+    checkpoint = load_checkpoint(run, device=_device(device))
+    scans = load_dataset(
+        data,
+        lidar=lidar or checkpoint.lidar.name,
+        split=split,
+        scheme=scheme,
+        features=checkpoint.features,
+        statistics=checkpoint.statistics,
+    )
+    count = inference.predict(
+        checkpoint, scans, out, samples=samples, seed=seed, with_probabilities=probabilities
+    )
+    said = {"predictions": str(out), "scans": count, "samples": samples}
+    _report(said, f"{out}: {count} scans labelled by {samples} samples each", as_json=as_json)
+
+
+def _check_model(model: str) -> None:
+    if model not in _MODELS:
+        raise InvalidInputError(f"unknown model {model!r}; known are {', '.join(_MODELS)}")
+
+
+def _check_free(path: Path, *, force: bool) -> None:
+    if path.exists() and not force:
+        raise InvalidInputError(f"{path}: exists already; choose another, or pass --force")
+
+
+def _config(preset: str, **changes: object) -> TrainingConfig:
+    """Return the settings of a preset with those changes that are not None."""
+    from dataclasses import replace
+
+    from baselines.configs import PRESETS
+
+    if preset not in PRESETS:
+        raise InvalidInputError(f"unknown preset {preset!r}; known are {', '.join(PRESETS)}")
+    given = {name: value for name, value in changes.items() if value is not None}
+    return replace(PRESETS[preset](), **given)  # type: ignore[arg-type]
+
+
+def _device(name: str | None) -> str:
+    """Return a device that can be used; a GPU is taken where there is one, never required."""
+    import torch
+
+    chosen = name or ("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        torch.empty(0, device=chosen)
+    except (RuntimeError, AssertionError) as err:
+        raise InvalidInputError(f"device {chosen!r} cannot be used here: {err}") from err
+    return chosen
+
+
+def _report(said: dict[str, object], text: str, *, as_json: bool) -> None:
+    typer.echo(json.dumps(said) if as_json else text)

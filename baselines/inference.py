@@ -1,0 +1,222 @@
+"""Stochastic inference: encode a scan once, decode many latents, and vote."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from baselines.checkpoints import Checkpoint
+from baselines.s3net import Latent, S3Net
+from baselines.steps import keep_freed_memory
+from semantic2d_dataset.access.torch_datasets import LidarDataset
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scoring.submission import PredictionsWriter
+
+SAMPLES = 32
+"""Latents drawn for each scan (paper, section on the results of S3-Net)."""
+
+_DECODED_AT_ONCE = 32  # latents whose hidden layers fit a CPU's cache
+_ENCODED_AT_ONCE = 32
+_WRITTEN_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class SampledLabels:
+    """What S samples say of N scans.
+
+    Parameters
+    ----------
+    labels
+        (N, B) u1: the class that most samples chose; of equals, the lowest id.
+    probabilities
+        (N, B, K) f4: softmax, mean over the samples.
+    entropy
+        (N, B) f4, nats: of those probabilities.
+    samples
+        (S, N, B) u1: the class that each sample chose.
+    """
+
+    labels: NDArray[np.uint8]
+    probabilities: NDArray[np.float32]
+    entropy: NDArray[np.float32]
+    samples: NDArray[np.uint8]
+
+
+def infer(
+    network: S3Net, features: Tensor, *, samples: int = SAMPLES, seed: int = 0
+) -> SampledLabels:
+    """Label scans by the majority of decoded samples of the latent.
+
+    Parameters
+    ----------
+    network
+        In evaluation mode.
+    features
+        (N, C, B) f4, standardised.
+    samples
+        Latents drawn for each scan, S.
+    seed
+        Of the latents.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no sample to draw, or the features have another shape.
+    """
+    if samples < 1:
+        raise InvalidInputError(f"samples: expected at least 1, found {samples}")
+    beams = features.shape[-1]
+    noise = torch.Generator().manual_seed(seed)
+    with torch.inference_mode():
+        laws = [network.encode(part) for part in torch.split(features, _ENCODED_AT_ONCE)]
+        law = Latent(*(torch.cat(parts) for parts in zip(*laws, strict=True)))
+        latents = _draw(law, samples, noise)  # (N, S, 1, L)
+        per_scan = [_decode_scan(network, drawn, beams) for drawn in latents]
+        chosen, votes, probabilities = (torch.stack(p) for p in zip(*per_scan, strict=True))
+        entropy = torch.special.entr(probabilities).sum(2)
+    return SampledLabels(
+        votes.argmax(2).to(torch.uint8).numpy(force=True),
+        probabilities.numpy(force=True),
+        entropy.numpy(force=True),
+        chosen.transpose(0, 1).numpy(force=True),
+    )
+
+
+def predict(
+    checkpoint: Checkpoint,
+    dataset: LidarDataset,
+    path: Path,
+    *,
+    samples: int = SAMPLES,
+    seed: int = 0,
+    method: str = "S3-Net",
+    with_probabilities: bool = False,
+) -> int:
+    """Label every scan of a data set's split, and write a predictions file.
+
+    Parameters
+    ----------
+    checkpoint
+        A trained model.
+    dataset
+        Scans of its lidar with its features, standardised by its statistics.
+    path
+        The file to make.
+    samples, seed
+        As for `infer`.
+    method
+        What the file calls the method.
+    with_probabilities
+        Write class probabilities too (20 bytes a beam).
+
+    Returns
+    -------
+    int
+        Number of scans labelled.
+
+    Raises
+    ------
+    InvalidInputError
+        If the data set does not fit the model.
+    WriteError
+        If the file cannot be written.
+    """
+    _check_dataset(checkpoint, dataset)
+    keep_freed_memory()
+    source = dataset.source
+    with (
+        PredictionsWriter(
+            path,
+            dataset=source.data.manifest.name,
+            dataset_version=source.data.manifest.version,
+            scheme=source.scheme,
+            split=source.split or "all",
+            taxonomy=checkpoint.taxonomy,
+            metadata=_metadata(checkpoint, method, seed),
+        ) as writer,
+        tqdm(total=len(dataset), desc="predicting", unit="scan", disable=None) as bar,
+    ):
+        for i, batch in enumerate(dataset.loader(_WRITTEN_AT_ONCE)):
+            own_seed = int(np.random.SeedSequence((seed, i)).generate_state(1)[0])
+            device = next(checkpoint.network.parameters()).device
+            features = batch["features"].to(device)
+            found = infer(checkpoint.network, features, samples=samples, seed=own_seed)
+            _write(writer, batch["scan_id"], found, with_probabilities=with_probabilities)
+            bar.update(len(features))
+    return len(dataset)
+
+
+def _write(
+    writer: PredictionsWriter,
+    scan_ids: Sequence[str],
+    found: SampledLabels,
+    *,
+    with_probabilities: bool,
+) -> None:
+    """Write a batch, one call for each run of scans of a sequence."""
+    start = 0
+    parts = (scan_id.rpartition("/") for scan_id in scan_ids)
+    for sequence_id, run in groupby(parts, key=lambda part: part[0]):
+        scan_index = np.array([int(index) for _, _, index in run], np.int64)
+        rows = slice(start, start + len(scan_index))
+        probabilities = found.probabilities[rows].astype(np.float16) if with_probabilities else None
+        writer.add(sequence_id, scan_index, found.labels[rows], probabilities)
+        start = rows.stop
+
+
+def _metadata(checkpoint: Checkpoint, method: str, seed: int) -> dict[str, Any]:
+    trained_on = " ".join(str(value) for value in checkpoint.dataset.values())
+    return {
+        "method": method,
+        "features": checkpoint.features,
+        "training_data": trained_on or "unknown",
+        "parameters": sum(p.numel() for p in checkpoint.network.parameters()),
+        "seeds": [seed],
+    }
+
+
+def _check_dataset(checkpoint: Checkpoint, dataset: LidarDataset) -> None:
+    name = dataset.source.data.manifest.name
+    if dataset.lidar != checkpoint.lidar:
+        raise InvalidInputError(
+            f"{name}: the model was trained on {checkpoint.lidar.name} "
+            f"({checkpoint.lidar.beams} beams), and these scans are of {dataset.lidar.name} "
+            f"({dataset.lidar.beams} beams); choose scans of the same lidar"
+        )
+    if dataset.taxonomy.digest != checkpoint.taxonomy.digest:
+        raise InvalidInputError(f"{name}: the model was trained on other classes")
+    if dataset.features != checkpoint.features or dataset.statistics != checkpoint.statistics:
+        raise InvalidInputError(
+            f"{name}: load it with features={checkpoint.features!r} and the model's statistics"
+        )
+
+
+def _draw(law: Latent, samples: int, noise: torch.Generator) -> Tensor:
+    """Draw latents (N, S, 1, L); on the CPU, so that every device gets the same."""
+    n, _, positions = law.mean.shape
+    drawn = torch.randn((n, samples, 1, positions), generator=noise).to(law.mean.device)
+    return law.mean[:, None] + law.log_sd.exp()[:, None] * drawn
+
+
+def _decode_scan(network: S3Net, latents: Tensor, beams: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Decode latents (S, 1, L) of one scan.
+
+    Returns
+    -------
+    labels (S, B) u1 of every sample, votes (B, K) i4, mean probabilities (B, K) f4
+    """
+    parts = torch.split(latents, _DECODED_AT_ONCE)
+    logits = torch.cat([network.decode(part, beams) for part in parts])
+    labels = logits.max(1).indices  # (S, B); argmax takes 5 times longer
+    votes = torch.zeros((network.classes, beams), dtype=torch.int32, device=labels.device)
+    votes.scatter_add_(0, labels, torch.ones_like(labels, dtype=torch.int32))
+    return labels.to(torch.uint8), votes.t(), logits.softmax(1).mean(0).t()

@@ -1,0 +1,81 @@
+"""One step of training, made quick on CPUs."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import sys
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from baselines.losses import loss_terms
+from baselines.s3net import S3Net
+
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # malloc.h
+_BATCH_NORM_MOMENTUM = 0.1  # torch's default, which the published network uses
+
+
+def step(
+    network: S3Net,
+    optimiser: torch.optim.Optimizer,
+    batch: Mapping[str, Tensor],
+    class_weights: Tensor,
+    *,
+    betas: Sequence[float],
+    micro_batch: int | None = None,
+) -> dict[str, float]:
+    """Take one step of the optimiser, and return the loss and its terms.
+
+    Parameters
+    ----------
+    network, optimiser
+        Changed in place.
+    batch
+        ``features`` (N, C, B) f4 and ``target`` (N, B) i8, 255 left out.
+    class_weights
+        (K,) f4.
+    betas
+        Weights of the three terms.
+    micro_batch
+        Scans that go through the network at a time, their gradients averaged; None takes all.
+        Batch norms and Lovasz-softmax see one micro-batch each. For batches of 1,024 in parts of
+        32 to 256, running statistics stayed within 0.01 % and the loss within 2.4 to 0.2 %, but a
+        gradient was 18 to 7 % off, where merely drawing other latents makes 5 to 8 %.
+    """
+    scans = len(batch["features"])
+    sums: dict[str, float] = {}
+    optimiser.zero_grad(set_to_none=True)
+    parts = (torch.split(batch[name], micro_batch or scans) for name in ("features", "target"))
+    for features, target in zip(*parts, strict=True):
+        terms = loss_terms(network(features), target, class_weights)
+        share = len(features) / scans
+        loss = terms.total(betas)
+        torch.autograd.backward(share * loss)
+        for name, value in {"loss": loss, **terms._asdict()}.items():
+            sums[name] = sums.get(name, 0.0) + share * value.item()
+    optimiser.step()
+    return sums
+
+
+def momentum_of_micro_batches(network: nn.Module, batch_size: int, micro_batch: int | None) -> None:
+    """Let batch norms forget as much in the micro-batches of a batch as they would in one."""
+    parts = max(1.0, batch_size / (micro_batch or batch_size))
+    for layer in network.modules():
+        if isinstance(layer, nn.BatchNorm2d):
+            layer.momentum = 1 - (1 - _BATCH_NORM_MOMENTUM) ** (1 / parts)
+
+
+def keep_freed_memory() -> None:
+    """Tell glibc to reuse the memory of a step in the next one.
+
+    By default it hands large blocks back to the kernel at once and gets fresh pages for the next
+    tensor, which takes most of the time of a step. The process keeps its peak of memory then.
+    """
+    if sys.platform != "linux":
+        return
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_MMAP_MAX, 0)
+        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)

@@ -1,0 +1,343 @@
+"""Train S3-Net: batches in, the epoch that validates best out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from baselines.checkpoints import (
+    Checkpoint,
+    has_state,
+    read_state,
+    save_checkpoint,
+    write_state,
+)
+from baselines.configs import TrainingConfig, learning_rate_at
+from baselines.losses import median_frequency_weights
+from baselines.s3net import S3Net
+from baselines.steps import keep_freed_memory, momentum_of_micro_batches, step
+from semantic2d_dataset.access.features import Statistics, channel_count
+from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.format.writing import write_text_atomically
+from semantic2d_dataset.scene.lidars import LidarSpec
+from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
+from semantic2d_dataset.scoring.metrics import Evaluator
+
+_RESUME = "resume"
+_LOG_NAME = "log.csv"
+
+
+class LabelledScans(Protocol):
+    """What training needs of a data set; `semantic2d_dataset.load_dataset` returns one."""
+
+    @property
+    def lidar(self) -> LidarSpec:
+        """The sensor of all scans."""
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The K classes of the labels."""
+
+    @property
+    def class_counts(self) -> NDArray[np.int64]:
+        """Labelled beams with a return of each class, (K,) i8."""
+
+    @property
+    def statistics(self) -> Statistics:
+        """What standardised the features."""
+
+    def __len__(self) -> int: ...
+
+    def loader(self, batch_size: int, *, shuffle: bool, seed: int) -> DataLoader[dict[str, Any]]:
+        """Batches with ``features`` (N, C, B) f4, ``label`` (N, B) i8, ``valid`` (N, B) bool."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a training left: the folder, its best epoch (from 1) and that epoch's score.
+
+    ``best_miou`` is a fraction over the validation split; ``epochs`` counts those trained.
+    """
+
+    folder: Path
+    best_epoch: int
+    best_miou: float
+    epochs: int
+    seconds: float
+
+
+@dataclass
+class _Run:
+    """What changes while training."""
+
+    network: S3Net
+    optimiser: torch.optim.Adam
+    class_weights: Tensor
+    log: list[dict[str, float]] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def device(self) -> torch.device:
+        return self.class_weights.device
+
+    @property
+    def best(self) -> dict[str, float]:
+        """The row of the epoch that validates best, the earliest of equals."""
+        return max(self.log, key=lambda row: row["val_miou"])
+
+
+def train(
+    config: TrainingConfig,
+    train_dataset: LabelledScans,
+    val_dataset: LabelledScans,
+    folder: Path,
+    *,
+    device: str | torch.device | None = None,
+    resume: bool = False,
+    about: Mapping[str, str] | None = None,
+) -> TrainingResult:
+    """Train S3-Net and keep the epoch of the highest validation mIoU.
+
+    Every epoch ends with complete files in `folder`: the best model (`load_checkpoint`),
+    ``log.csv``, and the state to resume from. An interruption loses the epoch under way only.
+    On one machine, the same seed gives the same model, resumed or not, unless a time limit ends
+    it: the schedule follows the clock then.
+
+    Parameters
+    ----------
+    config
+        Settings.
+    train_dataset, val_dataset
+        Scans of one lidar, standardised by the statistics of the training split.
+    folder
+        Made where missing.
+    device
+        ``cuda`` where there is one, else ``cpu``, unless given.
+    resume
+        Go on where an earlier training in `folder` stopped, if there is one.
+    about
+        Name, version and scheme of the data set, to be kept with the model.
+
+    Raises
+    ------
+    InvalidInputError
+        If a data set is empty or they do not fit, or the training in `folder` had other settings.
+    WriteError
+        If `folder` cannot be written.
+    """
+    _check_datasets(config, train_dataset, val_dataset)
+    where = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    keep_freed_memory()
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    forked = [torch.cuda.current_device()] if where.type == "cuda" else []
+    with torch.random.fork_rng(forked):
+        run = _start(config, train_dataset, where)
+        if resume and has_state(folder, _RESUME):
+            _restore(run, config, train_dataset, Path(folder))
+        clock = _Clock(config, run.seconds)
+        with _progress_bar() as bar:
+            while not clock.is_over(len(run.log)):
+                row = _train_epoch(run, train_dataset, config, clock, bar)
+                row["val_miou"] = validate(run.network, val_dataset)
+                run.seconds = row["seconds"] = clock.elapsed
+                run.log.append(row)
+                _save(run, config, train_dataset, Path(folder), about or {})
+                bar.set_postfix(mIoU=f"{row['val_miou']:.3f}", loss=f"{row['loss']:.1f}")
+    best = run.best
+    return TrainingResult(
+        Path(folder), int(best["epoch"]), best["val_miou"], len(run.log), run.seconds
+    )
+
+
+def validate(network: S3Net, dataset: LabelledScans, *, batch_size: int = 32) -> float:
+    """Return the mIoU, a fraction, of labels decoded from the mean of the latent."""
+    device = next(network.parameters()).device
+    evaluator = Evaluator(dataset.taxonomy)
+    network.eval()
+    with torch.inference_mode():
+        for batch in dataset.loader(batch_size, shuffle=False, seed=0):
+            features = batch["features"].to(device)
+            logits = network.decode(network.encode(features).mean, features.shape[2])
+            labels = logits.argmax(1).to("cpu", torch.uint8).numpy()
+            truth = batch["label"].to(torch.uint8).numpy()
+            evaluator.update(truth, labels, batch["valid"].numpy())
+    return evaluator.compute()["mIoU"] or 0.0
+
+
+class _Clock:
+    """How far a training is: by epochs, or by time where that is limited."""
+
+    def __init__(self, config: TrainingConfig, seconds_before: float) -> None:
+        self.config = config
+        self._started = time.monotonic() - seconds_before
+
+    @property
+    def elapsed(self) -> float:
+        return time.monotonic() - self._started
+
+    @property
+    def time_is_up(self) -> bool:
+        return self.config.time_limit_s is not None and self.elapsed >= self.config.time_limit_s
+
+    def is_over(self, epochs: int) -> bool:
+        return self.time_is_up or epochs >= self.config.epochs
+
+    def progress(self, epochs: float) -> float:
+        limit = self.config.time_limit_s
+        by_time = 0.0 if limit is None else self.elapsed / limit
+        return min(1.0, max(epochs / self.config.epochs, by_time))
+
+
+def _start(config: TrainingConfig, dataset: LabelledScans, device: torch.device) -> _Run:
+    torch.manual_seed(config.seed)
+    network = S3Net(channel_count(config.features), len(dataset.taxonomy)).to(device)
+    momentum_of_micro_batches(network, config.batch_size, config.micro_batch)
+    optimiser = torch.optim.Adam(
+        network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
+    weights = median_frequency_weights(dataset.class_counts) ** config.class_weight_power
+    return _Run(network, optimiser, weights.to(device))
+
+
+def _train_epoch(
+    run: _Run, dataset: LabelledScans, config: TrainingConfig, clock: _Clock, bar: tqdm[Any]
+) -> dict[str, float]:
+    """Train one epoch, cut short where the time is up; return its row of the log."""
+    done = len(run.log)
+    seed = _seed_of_epoch(config, done)
+    torch.manual_seed(seed)
+    loader = dataset.loader(config.batch_size, shuffle=True, seed=seed)
+    sums: dict[str, float] = {}
+    scans, rate = 0, 0.0
+    run.network.train()
+    for i, batch in enumerate(loader):
+        rate = learning_rate_at(config, clock.progress(done + i / len(loader)))
+        for group in run.optimiser.param_groups:
+            group["lr"] = rate
+        count = len(batch["label"])
+        terms = step(
+            run.network,
+            run.optimiser,
+            _to(batch, run.device),
+            run.class_weights,
+            betas=config.betas,
+            micro_batch=config.micro_batch,
+        )
+        for name, value in terms.items():
+            sums[name] = sums.get(name, 0.0) + count * value
+        scans += count
+        bar.update(clock.progress(done + (i + 1) / len(loader)) - bar.n)
+        if clock.time_is_up:
+            break
+    return {
+        "epoch": done + 1,
+        "seconds": 0.0,
+        "learning_rate": rate,
+        **{name: value / scans for name, value in sums.items()},
+    }
+
+
+def _seed_of_epoch(config: TrainingConfig, epoch: int) -> int:
+    """Order of scans and latents of an epoch depend on its number and the seed, nothing else."""
+    return int(np.random.SeedSequence((config.seed, epoch)).generate_state(1)[0])
+
+
+def _to(batch: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    target = batch["label"].masked_fill(~batch["valid"], UNLABELLED)
+    return {"features": batch["features"].to(device), "target": target.to(device)}
+
+
+def _check_datasets(config: TrainingConfig, *datasets: LabelledScans) -> None:
+    first = datasets[0]
+    for dataset in datasets:
+        if len(dataset) == 0:
+            raise InvalidInputError("training needs at least one scan in train and val each")
+        if (dataset.lidar, dataset.taxonomy) != (first.lidar, first.taxonomy):
+            raise InvalidInputError("train and val are of different lidars or classes")
+        if dataset.statistics != first.statistics:
+            raise InvalidInputError("val must be standardised by the statistics of train")
+    channels = channel_count(config.features)
+    if len(first.statistics.mean) != channels:
+        raise InvalidInputError(
+            f"features {config.features} are {channels} channels, and the data set has "
+            f"{len(first.statistics.mean)}; load it with features={config.features!r}"
+        )
+
+
+def _save(
+    run: _Run,
+    config: TrainingConfig,
+    dataset: LabelledScans,
+    folder: Path,
+    about: Mapping[str, str],
+) -> None:
+    """Leave the files of a finished epoch; the log comes last, when the rest is there."""
+    if run.best is run.log[-1]:
+        reached = {key: run.log[-1][key] for key in ("epoch", "val_miou", "seconds")}
+        parts = (config.features, dataset.statistics, dataset.lidar, dataset.taxonomy)
+        training = asdict(config) | {"reached": reached}
+        save_checkpoint(folder, Checkpoint(run.network, *parts, about, training))
+    said = {"config": asdict(config), "log": run.log, "statistics": asdict(dataset.statistics)}
+    moments = run.optimiser.state_dict()["state"]
+    tensors = {f"network/{key}": value for key, value in run.network.state_dict().items()}
+    tensors |= {
+        f"optimiser/{i}/{key}": value for i, m in moments.items() for key, value in m.items()
+    }
+    write_state(folder, _RESUME, said, tensors)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(run.log[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(run.log)
+    write_text_atomically(folder / _LOG_NAME, table.getvalue())
+
+
+def _restore(run: _Run, config: TrainingConfig, dataset: LabelledScans, folder: Path) -> None:
+    """Put a run where `_save` left it."""
+    said, tensors = read_state(folder, _RESUME)
+    now = json.loads(json.dumps(asdict(config) | {"statistics": asdict(dataset.statistics)}))
+    try:
+        before = said["config"] | {"statistics": said["statistics"]}
+        changed = [key for key in now if now[key] != before.get(key)]
+        log, seconds = list(said["log"]), float(said["log"][-1]["seconds"])
+    except (KeyError, TypeError, IndexError, ValueError) as err:
+        raise CorruptFileError(f"{folder}: the state to resume from is damaged: {err!r}") from err
+    if changed:
+        raise InvalidInputError(
+            f"{folder}: cannot resume, because other settings were used for "
+            f"{', '.join(changed)}; use the same, or another folder"
+        )
+    state = run.optimiser.state_dict()
+    for name, value in tensors.items():
+        kind, *rest = name.split("/")
+        if kind == "optimiser":
+            state["state"].setdefault(int(rest[0]), {})[rest[1]] = value
+    weights = {
+        name.removeprefix("network/"): value
+        for name, value in tensors.items()
+        if name.startswith("network/")
+    }
+    run.network.load_state_dict(weights)
+    run.optimiser.load_state_dict(state)
+    run.log, run.seconds = log, seconds
+
+
+def _progress_bar() -> tqdm[Any]:
+    return tqdm(
+        total=1.0,
+        desc="training",
+        bar_format="{desc} {percentage:3.0f}% |{bar}| {elapsed}<{remaining}{postfix}",
+        disable=None,
+    )

@@ -1,0 +1,63 @@
+"""Small labelled scans that a network can learn, without files."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, TensorDataset
+
+from semantic2d_dataset.access.features import Statistics
+from semantic2d_dataset.scene.lidars import LidarSpec
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
+
+LIDAR = LidarSpec("toy", "Toy", 61, -1.5, 0.05, 0.1, 30.0)
+
+
+def make_scans(scans: int, beams: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Features (N, 3, B) and labels (N, B): runs of beams whose features tell their class."""
+    rng = np.random.default_rng(seed)
+    runs = (rng.random((scans, beams)) < 0.1).cumsum(1)
+    labels = np.take_along_axis(rng.integers(0, 10, (scans, beams)), runs, axis=1)
+    noise = rng.normal(scale=0.2, size=(3, scans, beams))
+    features = np.stack((labels / 5 - 1, np.sin(labels), np.cos(labels))) + noise
+    return (
+        torch.from_numpy(features.transpose(1, 0, 2).astype(np.float32)),
+        torch.from_numpy(labels),
+    )
+
+
+class ToyScans:
+    """A data set in memory with what training asks for."""
+
+    lidar = LIDAR
+    taxonomy = SEMANTIC2D
+    statistics = Statistics((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+
+    def __init__(self, scans: int, seed: int = 0) -> None:
+        self.features, self.labels = make_scans(scans, LIDAR.beams, seed)
+        self.valid = torch.ones_like(self.labels, dtype=torch.bool)
+        self.batches_until_interrupt: int | None = None
+
+    @property
+    def class_counts(self) -> np.ndarray:
+        return np.bincount(self.labels.flatten(), minlength=10)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def loader(self, batch_size: int, *, shuffle: bool, seed: int) -> DataLoader:
+        return DataLoader(
+            TensorDataset(self.features, self.labels, self.valid),
+            batch_size,
+            shuffle=shuffle,
+            generator=torch.Generator().manual_seed(seed),
+            collate_fn=self.collate,
+        )
+
+    def collate(self, items: list) -> dict[str, torch.Tensor]:
+        if self.batches_until_interrupt is not None:
+            self.batches_until_interrupt -= 1
+            if self.batches_until_interrupt < 0:
+                raise KeyboardInterrupt
+        columns = zip(*items, strict=True)
+        return dict(zip(("features", "label", "valid"), map(torch.stack, columns), strict=True))

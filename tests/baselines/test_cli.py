@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from baselines.cli import app
+from semantic2d_dataset import open_dataset
+from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError, Semantic2DError
+from semantic2d_dataset.scoring.submission import score_predictions
+
+
+def run(*words: object) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exception is not None:
+        raise result.exception
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def model(dataset_folder: Path, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "s3net"
+    options = ("--data", dataset_folder, "--lidar", "small", "--preset", "quick", "--epochs", 1)
+    said = json.loads(run("train", "s3net", *options, "--out", out, "--json"))
+    assert said["best_epoch"] == said["epochs"] == 1
+    return out
+
+
+def test_a_trained_model_predicts_what_can_be_scored(
+    model: Path, dataset_folder: Path, tmp_path: Path
+):
+    out = tmp_path / "predictions.h5"
+    said = run("predict", model, "--data", dataset_folder, "--samples", 2, "--out", out, "--json")
+    data = open_dataset(dataset_folder)
+    scored = score_predictions(out, data)
+    assert json.loads(said)["scans"] == scored["submission"]["scans"]
+    assert 0 <= scored["mIoU"] < 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("other",), "unknown model 'other'; known are s3net"),
+        (("s3net", "--features", "RX"), "unknown features 'RX'"),
+        (("s3net", "--preset", "best"), "unknown preset 'best'; known are quick, paper"),
+        (("s3net", "--epochs", 0), "epochs: expected above 0"),
+        (("s3net", "--scheme", "none"), "unknown scheme 'none'"),
+        (("s3net", "--lidar", "none"), "no sequence of the lidar 'none'"),
+        (("s3net", "--data", "nowhere"), "nowhere"),
+        (("s3net", "--device", "abacus"), "device 'abacus' cannot be used here"),
+    ],
+)
+def test_what_cannot_be_trained_is_one_clear_error_and_no_file(
+    words, message: str, dataset_folder: Path, tmp_path: Path
+):
+    usual = ("--data", dataset_folder, "--lidar", "small", "--preset", "quick", "--epochs", 1)
+    out = tmp_path / "run"
+    with pytest.raises(Semantic2DError, match=message):
+        run("train", words[0], *usual, "--out", out, *words[1:])
+    assert not out.exists()
+
+
+def test_a_model_that_is_there_is_not_replaced_unless_forced(model: Path, dataset_folder: Path):
+    with pytest.raises(InvalidInputError, match="exists already"):
+        run("train", "s3net", "--data", dataset_folder, "--lidar", "small", "--out", model)
+
+
+def test_predictions_that_are_there_are_not_replaced_unless_forced(
+    model: Path, dataset_folder: Path, tmp_path: Path
+):
+    out = tmp_path / "predictions.h5"
+    out.write_text("precious")
+    words = ("predict", model, "--data", dataset_folder, "--samples", 1, "--out", out)
+    with pytest.raises(InvalidInputError, match="exists already"):
+        run(*words)
+    assert out.read_text() == "precious"
+    assert "scans labelled" in run(*words, "--force")
+
+
+def test_a_missing_model_is_one_clear_error(dataset_folder: Path, tmp_path: Path):
+    with pytest.raises(DatasetNotFoundError, match="no trained model here"):
+        run("predict", tmp_path, "--data", dataset_folder, "--out", tmp_path / "p.h5")
+
+
+def test_a_model_of_another_lidar_is_refused(model: Path, dataset_folder: Path, tmp_path: Path):
+    text = (model / "model.json").read_text()
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in model.glob("model*"):
+        (copy / path.name).write_bytes(path.read_bytes())
+    (copy / "model.json").write_text(text.replace('"range_max": 20.0', '"range_max": 30.0'))
+    with pytest.raises(InvalidInputError, match="choose scans of the same lidar"):
+        run("predict", copy, "--data", dataset_folder, "--out", tmp_path / "p.h5")
+
+
+def test_listing_the_commands_imports_nothing_heavy():
+    code = "import sys, baselines.cli; print({'torch', 'numba', 'h5py'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
