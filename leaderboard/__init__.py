@@ -1,0 +1,1 @@
+"""Predictions to validated, scored, ranked and published results."""
