@@ -126,6 +126,8 @@ SEQUENCE = FileSchema(
         "map/labels": ArraySpec(("|u1",), (2,), max_bytes=_MAX_WHOLE_BYTES),
         "streams/*/stamps_ns": ArraySpec(("<i8",), (1,), max_bytes=_MAX_WHOLE_BYTES),
         "streams/*/data": ArraySpec(_NUMBERS, (1, 2, 3)),
+        "streams/*/offsets": ArraySpec(("<i8",), (1,), max_bytes=_MAX_WHOLE_BYTES),
+        "streams/*/about": _JSON_BYTES,
         "original/*": ArraySpec(_NUMBERS, (1, 2, 3)),
     },
     attributes={

@@ -9,84 +9,165 @@ input ends without ``commit`` it removes the partial file.
 from __future__ import annotations
 
 import json
+import math
 import os
-import struct
 import sys
+import zlib
+from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, NamedTuple, cast
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
-from semantic2d_dataset.errors import Semantic2DError
-from semantic2d_dataset.format.container import check_container
-from semantic2d_dataset.format.schema import CHUNK_ROWS, MAX_CHUNK_BYTES, SCHEMAS, FileSchema
+from semantic2d_dataset.errors import CorruptFileError, Semantic2DError
+from semantic2d_dataset.format.chunks import DEFLATE_LEVEL, is_intact, pack_in_order
+from semantic2d_dataset.format.container import ContainerReader
+from semantic2d_dataset.format.schema import CHUNK_ROWS, SCHEMAS, FileSchema
 
 _FLAT_CHUNK = 1 << 16
+_CHUNK_BYTES = 1 << 22  # readers decompress a whole chunk for one row
 _DTYPES = {"i": np.int64, "f": np.float64}
+_FAILURES = (
+    OSError,
+    RuntimeError,
+    ValueError,
+    KeyError,
+    EOFError,
+    MemoryError,
+    zlib.error,
+    Semantic2DError,
+)
 
 
-def write(stream: BinaryIO, schema: FileSchema, partial: Path, final: Path) -> bool:
-    """Write what the stream tells; return whether the file was committed."""
+def write(stream: BufferedReader, schema: FileSchema, partial: Path, final: Path) -> None:
+    """Write what the stream tells, and give the file its final name.
+
+    Raises
+    ------
+    EOFError
+        If the stream ends before the file is committed.
+    CorruptFileError
+        If the file does not hold what was written to it.
+    """
     with h5py.File(partial, "x", libver=("v110", "v110"), locking=False) as file:
-        while (header := _read_header(stream)) is not None:
-            if header["op"] == "commit":
-                break
-            _apply(header, stream, file, schema)
-        else:
-            return False
-    check_container(partial, schema)
+        for place, stored in pack_in_order(_chunks(stream, file, schema)):
+            place.array.set_extent((place.stop, *place.array.shape[1:]))
+            place.array.write_direct_chunk(_offset(place.array, place.start), stored)
+    _check(partial, schema)
     _sync(partial)
     partial.replace(final)
     _sync(final.parent)
-    return True
 
 
-def _read_header(stream: BinaryIO) -> Any:
-    length = stream.read(4)
-    if len(length) < 4:
-        return None
-    text = stream.read(struct.unpack("<I", length)[0])
-    return json.loads(text)
+class _Place(NamedTuple):
+    """Which rows of an open HDF5 array a chunk holds."""
+
+    array: Any
+    start: int
+    stop: int
 
 
-def _apply(header: Any, stream: BinaryIO, file: Any, schema: FileSchema) -> None:
-    path = header["path"]
-    if header["op"] == "attributes":
-        owner = file[path] if path in file else file.require_group(path or "/")
-        for name, value in header["values"].items():
-            owner.attrs.create(name, _encode(value, schema.attribute_kinds(path)[name]))
-        return
-    dtype, shape = np.dtype(header["dtype"]), tuple(header["shape"])
-    rows = np.frombuffer(_read_exactly(stream, dtype.itemsize * int(np.prod(shape))), dtype)
-    array = file[path] if path in file else _new_array(file, path, dtype, shape)
-    before = len(array)
-    array.resize(before + shape[0], axis=0)
-    array[before:] = rows.reshape(shape)
+_Chunks = Iterator[tuple[_Place, NDArray[Any]]]
 
 
-def _read_exactly(stream: BinaryIO, count: int) -> bytes:
-    data = stream.read(count)
-    if len(data) < count:
-        raise EOFError("the parent process stopped in the middle of an array")
-    return data
+class _GrowingArray:
+    """Rows of one array on their way into chunks."""
+
+    def __init__(self, array: Any) -> None:
+        self._array, self._start, self._filled = array, 0, 0
+        self._chunk = np.zeros(array.chunks, array.dtype)
+
+    def grow(self, stream: BufferedReader, rows: int) -> _Chunks:
+        """Read rows from the stream; yield the chunks that they complete."""
+        while rows:
+            stop = min(self._filled + rows, len(self._chunk))
+            _read_into(stream, self._chunk[self._filled : stop])
+            rows, self._filled = rows - (stop - self._filled), stop
+            if stop == len(self._chunk):
+                yield from self.finish()
+
+    def finish(self) -> _Chunks:
+        """Yield the chunk that is being filled, the rest of it zeros."""
+        if self._filled:
+            stop = self._start + self._filled
+            yield _Place(self._array.id, self._start, stop), self._chunk
+            self._start, self._filled = stop, 0
+            self._chunk = np.zeros_like(self._chunk)
 
 
-def _new_array(file: Any, path: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Any:
-    row_bytes = max(1, dtype.itemsize * int(np.prod(shape[1:])))
+def _chunks(stream: BufferedReader, file: Any, schema: FileSchema) -> _Chunks:
+    """Do what the stream tells up to ``commit``; yield the chunks that are to be stored."""
+    arrays: dict[str, _GrowingArray] = {}
+    while (header := _read_header(stream))["op"] != "commit":
+        path = header["path"]
+        if header["op"] == "attributes":
+            _set_attributes(file, path, header["values"], schema)
+            continue
+        if path not in arrays:
+            arrays[path] = _GrowingArray(_new_array(file, path, header["dtype"], header["shape"]))
+        yield from arrays[path].grow(stream, header["shape"][0])
+    for array in arrays.values():
+        yield from array.finish()
+
+
+def _read_header(stream: BufferedReader) -> Any:
+    length = np.zeros(1, "<u4")
+    _read_into(stream, length)
+    text = np.zeros(length[0], np.uint8)
+    _read_into(stream, text)
+    return json.loads(text.tobytes())
+
+
+def _read_into(stream: BufferedReader, values: NDArray[Any]) -> None:
+    room = values.reshape(-1).view(np.uint8)
+    if stream.readinto(room.data) < len(room):
+        raise EOFError("the parent process stopped before the file was complete")
+
+
+def _set_attributes(file: Any, path: str, values: dict[str, Any], schema: FileSchema) -> None:
+    owner = file[path] if path in file else file.require_group(path or "/")
+    for name, value in values.items():
+        owner.attrs.create(name, _encode(value, schema.attribute_kinds(path)[name]))
+
+
+def _new_array(file: Any, path: str, dtype: str, shape: list[int]) -> Any:
+    row_bytes = max(1, np.dtype(dtype).itemsize * math.prod(shape[1:]))
     wanted = CHUNK_ROWS if len(shape) > 1 else _FLAT_CHUNK
-    chunk = (max(1, min(wanted, MAX_CHUNK_BYTES // row_bytes)), *(max(1, n) for n in shape[1:]))
     return file.create_dataset(
         path,
         shape=(0, *shape[1:]),
         maxshape=(None, *shape[1:]),
         dtype=dtype,
-        chunks=chunk,
+        chunks=(max(1, min(wanted, _CHUNK_BYTES // row_bytes)), *shape[1:]),
         compression="gzip",
-        compression_opts=4,
+        compression_opts=DEFLATE_LEVEL,
         shuffle=True,
         fletcher32=True,
     )
+
+
+def _check(path: Path, schema: FileSchema) -> None:
+    """Open the file as readers do, and compare every chunk in it with its checksum.
+
+    Decompressing too would cost a quarter of the time that compressing takes.
+    """
+    with ContainerReader(path, schema) as reader, h5py.File(path, "r", locking=False) as file:
+        for name in reader.names:
+            if not all(map(is_intact, _stored(file[name]))):
+                raise CorruptFileError(f"{path}: {name} does not hold what was written to it")
+
+
+def _stored(array: Any) -> Iterator[bytes]:
+    for start in range(0, len(array), array.chunks[0]):
+        yield array.id.read_direct_chunk(_offset(array.id, start))[1]
+
+
+def _offset(array: Any, row: int) -> tuple[int, ...]:
+    """Return where the chunk that begins at a row lies; chunks span the other axes."""
+    return (row, *[0] * (array.rank - 1))
 
 
 def _encode(value: Any, kind: str) -> Any:
@@ -111,14 +192,12 @@ def _sync(path: Path) -> None:
 def main() -> None:
     """Run the process; its last line on standard error says what failed."""
     kind, partial, final = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
-    done = False
     try:
-        done = write(sys.stdin.buffer, SCHEMAS[kind], partial, final)
-    except (OSError, RuntimeError, ValueError, KeyError, EOFError, Semantic2DError) as err:
-        sys.stderr.write(f"{type(err).__name__}: {err}\n")
+        write(cast("BufferedReader", sys.stdin.buffer), SCHEMAS[kind], partial, final)
+    except _FAILURES as err:
+        sys.exit(f"{type(err).__name__}: {err}")
     finally:
         partial.unlink(missing_ok=True)
-    sys.exit(0 if done else 1)
 
 
 if __name__ == "__main__":

@@ -63,6 +63,7 @@ class ContainerWriter:
             raise WriteError(f"{self.path}: the folder {self.path.parent} does not exist")
         remove_stale_partials(self.path)
         self._partial = partial_name(self.path)
+        self._rows: dict[str, tuple[str, tuple[int, ...]]] = {}
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _finish
         self._child = subprocess.Popen(
             [
@@ -105,19 +106,12 @@ class ContainerWriter:
         Raises
         ------
         InvalidInputError
-            If a name, dtype or rank is not in the schema.
+            If a name, dtype or rank is not in the schema, or rows are not like earlier ones.
         WriteError
             If the disk is full or the child process failed.
         """
         for name, array in arrays.items():
-            spec = self.schema.array(name)
-            if spec is None:
-                raise InvalidInputError(f"{self.path}: {name!r} has no place in {self.schema.kind}")
-            if array.dtype.str not in spec.dtypes or array.ndim not in spec.ndims:
-                raise InvalidInputError(
-                    f"{self.path}: {name}: expected {' or '.join(spec.dtypes)} of rank "
-                    f"{' or '.join(map(str, spec.ndims))}, found {array.dtype.str} {array.shape}"
-                )
+            self._check_rows(name, array)
         self._check_space(sum(array.nbytes for array in arrays.values()))
         for name, array in arrays.items():
             rows = np.ascontiguousarray(array)
@@ -137,6 +131,22 @@ class ContainerWriter:
         self._child.kill()
         self._child.wait()
         self._close()
+
+    def _check_rows(self, name: str, array: NDArray[Any]) -> None:
+        spec = self.schema.array(name)
+        if spec is None:
+            raise InvalidInputError(f"{self.path}: {name!r} has no place in {self.schema.kind}")
+        found = f"found {array.dtype.str} {array.shape}"
+        if array.dtype.str not in spec.dtypes or array.ndim not in spec.ndims:
+            raise InvalidInputError(
+                f"{self.path}: {name}: expected {' or '.join(spec.dtypes)} of rank "
+                f"{' or '.join(map(str, spec.ndims))}, {found}"
+            )
+        dtype, width = self._rows.setdefault(name, (array.dtype.str, array.shape[1:]))
+        if (array.dtype.str, array.shape[1:]) != (dtype, width):
+            raise InvalidInputError(
+                f"{self.path}: {name}: expected {dtype} {('n', *width)} as before, {found}"
+            )
 
     def _check_space(self, coming: int) -> None:
         free = shutil.disk_usage(self.path.parent).free
@@ -206,12 +216,17 @@ def remove_stale_partials(path: Path) -> None:
 
 def write_text_atomically(path: Path, text: str) -> None:
     """Write a UTF-8 file so that its name never means half of it."""
+    write_bytes_atomically(path, text.encode())
+
+
+def write_bytes_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that its name never means half of it."""
     path = Path(path)
     remove_stale_partials(path)
     partial = partial_name(path)
     try:
-        with partial.open("w", encoding="utf-8") as stream:
-            stream.write(text)
+        with partial.open("wb") as stream:
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         partial.replace(path)

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -122,6 +124,49 @@ def test_killed_child_is_a_write_error(tmp_path):
         for _ in range(100):
             w.append(make_arrays(500))
     assert list(tmp_path.iterdir()) == []
+
+
+FAIL_IN_A_THREAD = textwrap.dedent(
+    """
+    import threading, zlib
+    compress = zlib.compress
+    def fail(data, level=-1):
+        if threading.current_thread() is not threading.main_thread():
+            raise zlib.error("Error -4 while compressing data: insufficient memory")
+        return compress(data, level)
+    zlib.compress = fail
+    """
+)
+
+
+def test_failure_in_a_compressing_thread_is_a_write_error(tmp_path, monkeypatch):
+    startup, folder = tmp_path / "startup", tmp_path / "folder"
+    startup.mkdir()
+    folder.mkdir()
+    (startup / "sitecustomize.py").write_text(FAIL_IN_A_THREAD)
+    monkeypatch.setenv("PYTHONPATH", str(startup))
+    with pytest.raises(WriteError, match="Error -4 while compressing data"):
+        make_sequence(folder / "a.h5", 1000)
+    assert list(folder.iterdir()) == []
+
+
+def peak_mb(pid):
+    status = Path(f"/proc/{pid}/status")
+    if not status.exists():
+        pytest.skip("this system does not tell a process's peak memory in /proc")
+    return int(re.search(r"VmHWM:\s+(\d+) kB", status.read_text())[1]) / 1024
+
+
+def test_large_blocks_do_not_grow_the_writing_process(tmp_path):
+    rows = np.zeros((100_000, 500), np.float32)  # 200 MB
+    with pytest.raises(RuntimeError), SequenceWriter(tmp_path / "a.h5", HEADER) as writer:
+        writer.append(make_arrays(100))
+        writer._container.append({"original/x": rows[:20_000]})
+        before = peak_mb(writer._container._child.pid)
+        writer._container.append({"original/x": rows})
+        after = peak_mb(writer._container._child.pid)
+        raise RuntimeError
+    assert after < before + 40
 
 
 def test_full_disk_is_told_before_it_is_full(tmp_path, monkeypatch):
@@ -248,6 +293,19 @@ def test_array_that_is_not_of_the_format_is_named(arrays, says, tmp_path):
         SequenceWriter(tmp_path / "a.h5", HEADER) as writer,
     ):
         writer.append(arrays)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "later", [np.zeros((3, 5), np.float32), np.zeros((3, 1), np.float32), np.zeros((3, 4))]
+)
+def test_rows_unlike_earlier_ones_are_refused(later, tmp_path):
+    with (
+        pytest.raises(InvalidInputError, match=r"original/x: expected <f4 \('n', 4\) as before"),
+        SequenceWriter(tmp_path / "a.h5", HEADER) as writer,
+    ):
+        writer._container.append({"original/x": np.zeros((3, 4), np.float32)})
+        writer._container.append({"original/x": later})
     assert list(tmp_path.iterdir()) == []
 
 
