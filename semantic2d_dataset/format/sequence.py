@@ -304,6 +304,16 @@ class SequenceReader:
         except (KeyError, TypeError, InvalidInputError) as err:
             raise CorruptFileError(f"{self.path}: the map is not valid: {err}") from err
 
+    def describe_stream(self, name: str) -> dict[str, Any]:
+        """Return what is known of ``streams/<name>``: its topic, type, stamps and columns.
+
+        Raises
+        ------
+        InvalidInputError
+            If the sequence has no such stream.
+        """
+        return dict(self._container.read_json(f"streams/{name}/about"))
+
     def content_digest(self) -> str:
         """Return the SHA-256 over arrays and what describes them, not dates or generators.
 
