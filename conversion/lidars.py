@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from conversion.bags import Topic
+from conversion.recordings import Topic
 from conversion.scans import Beams
 from conversion.transforms import Mount
 from semantic2d_dataset.errors import InvalidInputError, RecordingError
@@ -65,9 +65,9 @@ def place_lidar(spec: LidarSpec, given: Mount | None, in_tf: Mount | None) -> tu
     if given is not None:
         return replace(spec, base_T_lidar=given), "as given"
     if in_tf is not None:
-        return replace(spec, base_T_lidar=in_tf), "tf"
+        return replace(spec, base_T_lidar=in_tf), "from tf"
     if spec.base_T_lidar != _NO_MOUNT:
-        return spec, f"the description of {spec.name}"
+        return spec, f"from the description of {spec.name}"
     return spec, "not found: taken as identity; --mount x,y,z,roll,pitch,yaw sets it"
 
 

@@ -1,165 +1,102 @@
-"""What a conversion will do: the user's options, and the choices that a survey allows."""
+"""What a conversion will write, and where it comes from."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from conversion.bags import Bag, Topic
-from conversion.lidars import choose_lidar, place_lidar
-from conversion.poses import FoundPoses, PoseRequest, find_poses, pose_topics
-from conversion.scans import ScanDecoder
-from conversion.survey import Survey, choose_scan_topic, make_survey
-from conversion.transforms import Mount
-from semantic2d_dataset.errors import InvalidInputError, RecordingError
-from semantic2d_dataset.scene.lidars import LidarSpec
+from conversion.options import Options
+from semantic2d_dataset.format.sequence import SequenceHeader
+from semantic2d_dataset.scene.maps import SemanticMap
+
+BLOCK = 512
+"""Scans held at once."""
+
+Arrays = dict[str, NDArray[Any]]
+"""Rows by the names of `semantic2d_dataset.format.schema.SEQUENCE`."""
 
 
 @dataclass(frozen=True)
-class Options:
-    """What a user may decide; None and the defaults are found from the recording.
+class SequencePlan:
+    """One sequence, decided upon before the first range of it is written.
 
     Parameters
     ----------
-    scan_topic
-        The topic of the scans; None takes the only one.
-    poses, map_frame, max_gap_s
-        Where poses come from, as `conversion.poses.PoseRequest`.
-    base_frame
-        The robot's frame; None takes base_link or base_footprint.
-    mount
-        x y z (m) roll pitch yaw (rad) of the lidar on its base; None takes it from tf.
-    stamps
-        ``header``, or ``record`` where header stamps cannot be used.
-    lidar
-        A lidar of the release or a YAML file; None recognises or describes it.
-    reverse_intensities
-        Whether the driver stores intensities in the opposite order of the ranges.
-    drop_without_pose
-        Whether scans without a pose are left out; else their pose is NaN.
-    environment, recording
-        Parts of the sequence id; None takes them from the path.
-    license
-        Licence of the data.
-    """
-
-    scan_topic: str | None = None
-    poses: str = "auto"
-    map_frame: str = "map"
-    max_gap_s: float | None = None
-    base_frame: str | None = None
-    mount: Mount | None = None
-    stamps: str = "header"
-    lidar: str | None = None
-    reverse_intensities: bool = False
-    drop_without_pose: bool = False
-    environment: str | None = None
-    recording: str | None = None
-    license: str = "unknown"
-
-    def __post_init__(self) -> None:
-        if self.stamps not in ("header", "record"):
-            raise InvalidInputError(f"stamps: expected header or record, found {self.stamps!r}")
-        if self.max_gap_s is not None and not 0 <= self.max_gap_s < math.inf:
-            raise InvalidInputError(
-                f"max_gap_s: expected a number of seconds, 0 or more, found {self.max_gap_s}"
-            )
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything that is decided before the first range is written.
-
-    Parameters
-    ----------
-    topic, decode
-        The scan topic, and the decoder of its messages.
-    found
-        The survey of the recording.
-    lidar
-        The sensor with its mount.
-    base
-        The robot's frame; None where tf has none.
-    poses
-        A pose for each scan of the survey.
-    keep
-        (N,) bool, the scans that are written.
-    reverse_intensities
-        Whether intensities run against the ranges.
+    header
+        What is said of the sequence; sources, versions and options join its provenance later.
+    scans_in, scans_out
+        Scans that the source holds for this sequence, and how many of them are written.
+    scans_with_pose
+        How many of the scans of the source have a pose.
+    duration_s
+        From the first scan to the last, s.
+    blocks
+        Reads the source (again), and yields rows of up to `BLOCK` scans at a time; arrays that
+        are not per scan (streams, original) may join any of them.
+    topic, frame
+        Of the scans, as the source names them.
+    pose_source, pose_max_gap_s
+        Where poses come from, and over what time they were interpolated.
     notices
         What was guessed, for the user.
+    reverse_intensities
+        Whether intensities were reversed.
+    lists
+        Split lists of a published layout, their bytes by name (``train``, ``dev``, ``test``).
+    members
+        (scans_out,) u1, what these lists make of each scan: 0 train, 1 val, 2 test, 255 none.
+    scene
+        The map, where the source brings one.
     """
 
-    topic: Topic
-    decode: ScanDecoder
-    found: Survey
-    lidar: LidarSpec
-    base: str | None
-    poses: FoundPoses
-    keep: NDArray[np.bool_]
-    reverse_intensities: bool
-    notices: tuple[str, ...]
+    header: SequenceHeader
+    scans_in: int
+    scans_out: int
+    scans_with_pose: int
+    duration_s: float
+    blocks: Callable[[], Iterator[Arrays]]
+    topic: str
+    frame: str = ""
+    pose_source: str = "none"
+    pose_max_gap_s: float | None = None
+    notices: tuple[str, ...] = ()
+    reverse_intensities: bool = False
+    lists: Mapping[str, bytes] = field(default_factory=dict)
+    members: NDArray[np.uint8] | None = None
+    scene: SemanticMap | None = None
 
 
-def make_plan(bag: Bag, options: Options) -> Plan:
-    """Read a recording once, and decide how to convert it.
+class Source(Protocol):
+    """Anything that sequences can be made of, open for reading; a context manager.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be converted, or not in this way.
-    InvalidInputError
-        If an option names nothing known.
+    Every failure is a `RecordingError` that names the path.
     """
-    topic, decode = choose_scan_topic(bag, options.scan_topic), ScanDecoder(bag)
-    pose_sources = pose_topics(bag, options.poses)
-    found = make_survey(bag, topic, decode, stamps=options.stamps, poses=pose_sources)
-    lidar, lidar_how = choose_lidar(bag.path, topic, found.beams, options.lidar)
-    base = _base_frame(bag.path, found, options.base_frame)
-    in_tf = None if base is None else found.transforms.mount(base, found.beams.frame)
-    lidar, mount_how = place_lidar(lidar, options.mount, in_tf)
-    poses = _poses(bag.path, found, options, base, lidar)
-    keep = poses.known if options.drop_without_pose else np.full(len(poses.poses), True)  # noqa: FBT003
-    if not keep.any():
-        why = "; ".join(poses.notices) or f"{poses.source} covers none"
-        raise RecordingError(bag.path, f"no scan has a pose to be kept for: {why}")
-    notices = (f"lidar {lidar_how}", f"mount {mount_how}", *poses.notices, *_oddities(found))
-    return Plan(
-        topic, decode, found, lidar, base, poses, keep, options.reverse_intensities, notices
-    )
 
+    path: Path
+    kind: str
+    """Such as ``ROS 1 bag`` or ``published Semantic2D layout``, for people."""
+    versions: Mapping[str, str]
+    """Versions of the libraries that read it, for the provenance."""
 
-def _base_frame(path: Path, found: Survey, named: str | None) -> str | None:
-    if named is None:
-        return found.transforms.base_of(found.beams.frame)
-    base = named.strip("/")
-    if base not in found.transforms.frames:
-        frames = ", ".join(found.transforms.frames) or "none"
-        raise RecordingError(path, f"no frame {named!r} in tf; its frames: {frames}")
-    return base
+    def __enter__(self) -> Self: ...
 
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
 
-def _poses(
-    path: Path, found: Survey, options: Options, base: str | None, lidar: LidarSpec
-) -> FoundPoses:
-    map_frame = options.map_frame.strip("/")
-    request = PoseRequest(options.poses, map_frame, options.max_gap_s, options.stamps)
-    # without a base in tf the chain ends at the lidar, and its mount leads back to the base
-    target = (found.beams.frame, lidar.base_T_lidar) if base is None else (base, None)
-    return find_poses(path, request, found.stamps_ns, found.transforms, found.poses, target)
+    def files(self) -> Sequence[Path]:
+        """Return the files that are read, for digests."""
+        ...
 
-
-def _oddities(found: Survey) -> tuple[str, ...]:
-    notices = []
-    repeated = int((np.diff(found.stamps_ns) == 0).sum())
-    if repeated:
-        notices.append(f"{repeated} scans repeat the stamp before them: kept")
-    usual = {0, found.beams.count} if not found.has_intensities else {found.beams.count}
-    odd = sum(n for count, n in found.intensity_counts.items() if count not in usual)
-    if odd:
-        notices.append(f"{odd} scans lack one intensity for each beam: NaN, or left out if all do")
-    return tuple(notices)
+    def plans(self, options: Options) -> tuple[SequencePlan, ...]:
+        """Decide what becomes of it; at least one sequence."""
+        ...

@@ -5,24 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from conversion.bags import Bag, Message, Topic
-from conversion.scans import plain_frame
-from conversion.tracks import TrackLog, default_gap_s, values_of
+from conversion.recordings import PoseSample, Recording, Topic
+from conversion.tracks import TrackLog, default_gap_s
 from conversion.transforms import Mount, Transforms
 from semantic2d_dataset.errors import RecordingError
 from semantic2d_dataset.scene.geometry import compose, invert, mount_in_plane
 
-POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
-POSE_TYPES = (
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    POSE_STAMPED,
-    "nav_msgs/msg/Odometry",
-)
 # Poses of where a robot should be, or was said to be by hand; odometry is in no map.
 _NOT_MEASURED = ("goal", "initialpose", "initial_pose", "target", "waypoint", "clicked")
 
@@ -75,17 +67,15 @@ class PoseLog:
         self.tracks: dict[str, TrackLog] = {}
         self.frames: dict[str, str] = {}
 
-    def add(self, message: Message, parsed: Any) -> None:
-        """Add a message of one of `POSE_TYPES`."""
-        pose = parsed.pose if message.type == POSE_STAMPED else parsed.pose.pose
-        self.frames[message.topic] = plain_frame(parsed.header.frame_id)
-        value = values_of(pose.position, pose.orientation)
-        if value is not None:
-            track = self.tracks.setdefault(message.topic, TrackLog())
-            track.add(parsed.header.stamp, message.record_ns, value)
+    def add(self, topic: str, sample: PoseSample, record_ns: int) -> None:
+        """Add a pose of a topic that was recorded at a time."""
+        self.frames[topic] = sample.frame
+        if sample.values is not None:
+            log = self.tracks.setdefault(topic, TrackLog())
+            log.add(sample.stamp_ns, record_ns, sample.values)
 
 
-def pose_topics(bag: Bag, source: str) -> tuple[Topic, ...]:
+def pose_topics(recording: Recording, source: str) -> tuple[Topic, ...]:
     """Return the topics to collect poses from.
 
     Raises
@@ -93,7 +83,7 @@ def pose_topics(bag: Bag, source: str) -> tuple[Topic, ...]:
     RecordingError
         If `source` names a topic that holds no poses.
     """
-    topics = bag.of_type(POSE_TYPES)
+    topics = recording.pose_topics
     if source in (TF, NONE):
         return ()
     if source == AUTO:
@@ -102,7 +92,7 @@ def pose_topics(bag: Bag, source: str) -> tuple[Topic, ...]:
     if not named:
         known = ", ".join(topic.name for topic in topics) or "none"
         raise RecordingError(
-            bag.path,
+            recording.path,
             f"no topic {source!r} with poses; topics with poses: {known}; or pass --poses tf, "
             "auto or none",
         )
@@ -199,7 +189,7 @@ def _why_none(from_tf: FoundPoses | str, frames: Mapping[str, str], request: Pos
 
 def _is_measured(topic: Topic) -> bool:
     name = topic.name.lower()
-    return topic.type != POSE_TYPES[-1] and not any(word in name for word in _NOT_MEASURED)
+    return "Odometry" not in topic.type and not any(word in name for word in _NOT_MEASURED)
 
 
 def _unknown(at_ns: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from conversion.bags import Bag, Message
-
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
+CDR_LITTLE_ENDIAN = b"\x00\x01"
+"""First bytes of a message in CDR, its encapsulation."""
 
 _ROS1_HEADER = struct.Struct("<4I")  # seq, sec, nsec, length of frame_id
 _CDR_HEADER = struct.Struct("<iII")  # sec, nanosec, length of frame_id with its NUL
-_CDR_LITTLE_ENDIAN = b"\x00\x01"
 _LIMITS = struct.Struct("<7fI")  # angles, times and range limits, number of ranges
 _COUNT = struct.Struct("<I")
+_F4 = np.dtype("<f4")
 _ANGLE_SHARE = 0.1  # of a beam's width: how far angles may wander within a topic
 
 
@@ -88,54 +88,15 @@ class Beams:
         return f"angles {found[0]:.6f} to {found[1]:.6f} after {ends[0]:.6f} to {ends[1]:.6f} rad"
 
 
-class ScanDecoder:
-    """Turn messages into scans: by their layout where it is ROS's own, else by rosbags.
-
-    Parameters
-    ----------
-    bag
-        Where the messages come from; its definition of LaserScan decides.
-    """
-
-    def __init__(self, bag: Bag) -> None:
-        self._bag = bag
-        self._fast: Callable[[bytes], Scan | None] | None = None
-        if bag.is_standard(LASER_SCAN):
-            self._fast = decode_ros1 if bag.ros1 else decode_cdr
-
-    def __call__(self, message: Message) -> Scan:
-        """Decode a message.
-
-        Raises
-        ------
-        RecordingError
-            If its bytes are no LaserScan.
-        """
-        found = self._fast(message.raw) if self._fast is not None else None
-        return found if found is not None else self.parse(message)
-
-    def parse(self, message: Message) -> Scan:
-        """Decode a message through rosbags' deserialiser, whatever its layout."""
-        return self._bag.read(message, _scan_of)
-
-
-def _scan_of(message: Any) -> Scan:
-    stamp = message.header.stamp
-    return Scan(
-        int(stamp.sec) * 10**9 + int(stamp.nanosec),
-        plain_frame(message.header.frame_id),
-        float(message.angle_min),
-        float(message.angle_increment),
-        float(message.range_min),
-        float(message.range_max),
-        np.asarray(message.ranges, np.float32),
-        np.asarray(message.intensities, np.float32),
-    )
-
-
 def plain_frame(name: str) -> str:
     """Write a frame as tf2 does: tf allowed a leading slash."""
     return name.strip().lstrip("/")
+
+
+@lru_cache(4096)
+def read_frame(name: bytes) -> str:
+    """Read a frame of a message; the same few come again and again."""
+    return plain_frame(name.decode())
 
 
 def decode_ros1(raw: bytes) -> Scan | None:
@@ -150,7 +111,7 @@ def decode_ros1(raw: bytes) -> Scan | None:
 
 def decode_cdr(raw: bytes) -> Scan | None:
     """Decode a LaserScan in little-endian CDR; None where the bytes are not laid out like one."""
-    if raw[:2] != _CDR_LITTLE_ENDIAN:
+    if raw[:2] != CDR_LITTLE_ENDIAN:
         return None
     try:
         sec, nsec, size = _CDR_HEADER.unpack_from(raw, 4)
@@ -164,12 +125,12 @@ def decode_cdr(raw: bytes) -> Scan | None:
 def _decode_body(raw: bytes, at: int, stamp_ns: int, frame: bytes) -> Scan | None:
     angle_min, _, increment, _, _, range_min, range_max, count = _LIMITS.unpack_from(raw, at)
     at += _LIMITS.size
-    ranges = np.frombuffer(raw, "<f4", count, at)
+    ranges = np.frombuffer(raw, _F4, count, at)
     at += 4 * count
     (count,) = _COUNT.unpack_from(raw, at)
     at += _COUNT.size
-    intensities = np.frombuffer(raw, "<f4", count, at)
+    intensities = np.frombuffer(raw, _F4, count, at)
     if at + 4 * count != len(raw):
         return None
-    name = plain_frame(frame.decode())
+    name = read_frame(frame)
     return Scan(stamp_ns, name, angle_min, increment, range_min, range_max, ranges, intensities)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from conversion.bags import Message
-from conversion.scans import plain_frame
-from conversion.tracks import TrackLog, default_gap_s, planar, values_of
+from conversion.recordings import TransformSample
+from conversion.spill import Spill
+from conversion.tracks import TrackLog, default_gap_s, planar
 from semantic2d_dataset.scene.geometry import compose, invert
-
-TF_MESSAGES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 Mount = tuple[float, float, float, float, float, float]
 _BASES = ("base_link", "base_footprint")
@@ -34,7 +32,7 @@ class Edge(NamedTuple):
     @property
     def constant(self) -> NDArray[np.float64]:
         """The first value as a (4, 4) matrix."""
-        matrix = _matrix(self.log.values[0])
+        matrix = _matrix(self.log.first)
         if self.inverse:
             matrix[:3, :3] = matrix[:3, :3].T
             matrix[:3, 3] = -matrix[:3, :3] @ matrix[:3, 3]
@@ -43,24 +41,22 @@ class Edge(NamedTuple):
     @property
     def is_rigid(self) -> bool:
         """Whether the transform never moves."""
-        values = self.log.values
-        values[values[:, 3:] @ values[0, 3:] < 0, 3:] *= -1  # q and -q are one rotation
-        return self.static or bool((np.ptp(values, axis=0) <= _RIGID).all())
+        return self.static or bool((self.log.extent <= _RIGID).all())
 
     @property
     def is_level(self) -> bool:
         """Whether the transform keeps z upward, in every sample."""
-        x, y, z, w = self.log.values[:, 3:].T
-        return bool((w * w - x * x - y * y + z * z >= _LEVEL).all())
+        return self.log.upright >= _LEVEL
 
 
 class Transforms:
     """Collect transforms, then answer for chains of them.
 
-    Frames lose their leading slash, and transforms that are no poses are left out.
+    All samples are kept, 40 bytes each, in one temporary file once they are many.
     """
 
     def __init__(self) -> None:
+        self._spill = Spill()
         self._logs: dict[tuple[str, str], TrackLog] = {}
         self._static: set[tuple[str, str]] = set()
         self._neighbours: dict[str, list[str]] = {}
@@ -70,21 +66,21 @@ class Transforms:
         """Every frame that occurs."""
         return tuple(sorted(self._neighbours))
 
-    def add(self, message: Message, parsed: Any) -> None:
-        """Add the transforms of a TFMessage; static are those of a topic named tf_static."""
-        static = message.topic.rsplit("/", 1)[-1] == "tf_static"
-        for item in parsed.transforms:
-            value = values_of(item.transform.translation, item.transform.rotation)
-            if value is None:
-                continue
-            key = (plain_frame(item.header.frame_id), plain_frame(item.child_frame_id))
-            if key not in self._logs:
-                self._logs[key] = TrackLog()
-                self._neighbours.setdefault(key[0], []).append(key[1])
-                self._neighbours.setdefault(key[1], []).append(key[0])
-            if static:
-                self._static.add(key)
-            self._logs[key].add(item.header.stamp, message.record_ns, value)
+    def moving(self) -> Iterator[TrackLog]:
+        """Yield the samples of every transform that is not static."""
+        return (log for key, log in self._logs.items() if key not in self._static)
+
+    def add(self, sample: TransformSample, record_ns: int) -> None:
+        """Add a transform that was recorded at a time."""
+        stamp_ns, parent, child, values, static = sample
+        log = self._logs.get((parent, child))
+        if log is None:
+            log = self._logs[parent, child] = TrackLog(self._spill)
+            self._neighbours.setdefault(parent, []).append(child)
+            self._neighbours.setdefault(child, []).append(parent)
+        if static:
+            self._static.add((parent, child))
+        log.add(stamp_ns, record_ns, values)
 
     def chain(self, parent: str, child: str) -> tuple[str, ...] | None:
         """Return the frames from one to another, or None where nothing connects them."""
@@ -144,7 +140,7 @@ class Transforms:
         found, postdated = np.zeros((at_ns.size, 3)), 0
         for edge in edges:
             if edge not in moving or last is None:
-                step = planar(edge.log.values[-1:])
+                step = planar(edge.log.last[None])
             else:
                 held, lead = edge.log is not last, edge.log.lead_ns - last.lead_ns
                 lead = lead if stamps == "header" and lead > _POSTDATED_NS else 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -163,10 +164,16 @@ class Recording:
         message = self.new(type_, transforms=[item])
         self.add(topic, message, ns if record_ns is None else record_ns)
 
-    def write(self, folder: Path, name: str = "drive") -> Path:
-        """Write the bag; its path is a .bag file, or a ROS 2 folder."""
+    def write(
+        self, folder: Path, name: str = "drive", *, compression: str | None = None, chunk: int = 0
+    ) -> Path:
+        """Write the bag; its path is a .bag file, or a ROS 2 folder.
+
+        `compression` is bz2 or lz4 in ROS 1; file, message or storage (of MCAP) in ROS 2.
+        `chunk` is the size in bytes that a chunk of ROS 1 grows to.
+        """
         path = folder / (f"{name}.bag" if self.kind == "ros1" else name)
-        with self._writer(path) as writer:
+        with self._writer(path, compression, chunk) as writer:
             serialise: Callable[[Any, str], Any] = self.store.serialize_cdr
             if self.kind == "ros1":
                 serialise = self.store.serialize_ros1
@@ -178,11 +185,38 @@ class Recording:
                 writer.write(connections[key], record_ns, serialise(message, type_))
         return path
 
-    def _writer(self, path: Path) -> Any:
+    def _writer(self, path: Path, compression: str | None, chunk: int) -> Any:
         if self.kind == "ros1":
-            return Writer1(path)
+            writer = Writer1(path)
+            if compression:
+                writer.set_compression(Writer1.CompressionFormat[compression.upper()])
+            writer.chunk_threshold = chunk or writer.chunk_threshold
+            return writer
         plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
-        return Writer2(path, version=9, storage_plugin=plugin)
+        writer2 = Writer2(path, version=9, storage_plugin=plugin)
+        if compression:
+            writer2.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+        return writer2
+
+
+def storage_of(path: Path) -> Path:
+    """The file that holds the messages of a bag."""
+    return path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+
+
+def add_checksums(mcap: Path) -> None:
+    """Give an MCAP the checksums that ROS 2's recorder writes, and rosbags' does not."""
+    data = bytearray(mcap.read_bytes())
+    at = 8
+    while data[at] != 0x02:
+        size = int.from_bytes(data[at + 1 : at + 9], "little")
+        if data[at] == 0x06:  # an uncompressed chunk: times, size, checksum, codec, size, records
+            crc = zlib.crc32(data[at + 9 + 40 : at + 9 + size])
+            data[at + 33 : at + 37] = crc.to_bytes(4, "little")
+        at += 9 + size
+    start = int.from_bytes(data[at + 9 : at + 17], "little")
+    data[at + 25 : at + 29] = zlib.crc32(data[start : at + 25]).to_bytes(4, "little")
+    mcap.write_bytes(data)
 
 
 def straight_drive(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from conversion.bags import Bag
-from conversion.scans import LASER_SCAN, Beams, ScanDecoder, decode_cdr, decode_ros1
+from conversion.ros import RosRecording
+from conversion.scans import LASER_SCAN, Beams, decode_cdr, decode_ros1
 from tests.conversion.recordings import KINDS, LASER, START_NS, Recording
 
 NAN_BITS = np.array([0x7F800001, 0x7FC12345, 0xFFC00000, 0x00000001], np.uint32).view(np.float32)
@@ -34,18 +35,17 @@ def same(a, b) -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_message_decodes_as_rosbags_deserialises_it(kind, tmp_path, monkeypatch):
+def test_every_message_decodes_as_rosbags_deserialises_it(kind, tmp_path):
     fast = decode_ros1 if kind == "ros1" else decode_cdr
-    with Bag(odd_scans(kind).write(tmp_path)) as bag:
-        assert bag.is_standard(LASER_SCAN)
-        decode = ScanDecoder(bag)
-        messages = list(bag.messages(bag.of_type((LASER_SCAN,))))
+    with RosRecording(Bag(odd_scans(kind).write(tmp_path))) as recording:
+        assert recording.bag.is_standard(LASER_SCAN)
+        messages = list(recording.messages(recording.scan_topics))
         assert len(messages) == 41
         for message in messages:
             found = fast(message.raw)
             assert found is not None
-            assert same(found, decode.parse(message))
-            assert same(found, decode(message))
+            assert same(found, recording.parse_scan(message))
+            assert same(found, recording.scan(message))
 
 
 @pytest.mark.parametrize(("kind", "fast"), [("ros1", decode_ros1), ("db3", decode_cdr)])
@@ -66,11 +66,24 @@ def test_big_endian_cdr_is_left_to_rosbags(tmp_path):
     big = bytes(drive.store.serialize_cdr(drive.messages[0][3], LASER, little_endian=False))
     assert decode_cdr(big) is None
     drive.store.serialize_cdr = lambda *_: big
-    with Bag(drive.write(tmp_path)) as bag:
-        (message,) = bag.messages(bag.topics)
-        scan = ScanDecoder(bag)(message)
+    with RosRecording(Bag(drive.write(tmp_path))) as recording:
+        (message,) = recording.messages(recording.topics)
+        scan = recording.scan(message)
     assert scan.ranges.tolist() == [1.5] * 8
     assert scan.stamp_ns == START_NS
+
+
+def test_a_scan_of_ros1_after_2038_keeps_its_stamp(tmp_path):
+    drive = Recording("ros1")
+    drive.add_scan(START_NS, [1.5] * 8)
+    late = 3_000_000_000
+    whole = bytearray(drive.store.serialize_ros1(drive.messages[0][3], LASER))
+    whole[4:8] = late.to_bytes(4, "little")
+    drive.store.serialize_ros1 = lambda *_: bytes(whole)
+    with RosRecording(Bag(drive.write(tmp_path))) as recording:
+        (message,) = recording.messages(recording.topics)
+        assert recording.scan(message).stamp_ns == late * 10**9
+        assert recording.parse_scan(message).stamp_ns == late * 10**9
 
 
 def test_a_bag_with_its_own_laser_scan_is_read_by_its_own_definition(tmp_path):
@@ -78,10 +91,15 @@ def test_a_bag_with_its_own_laser_scan_is_read_by_its_own_definition(tmp_path):
     drive.add_scan(START_NS, [1.5] * 8)
     path = drive.write(tmp_path)
     data = path.read_bytes()
-    assert b"float32[] intensities" in data
-    path.write_bytes(data.replace(b"float32[] intensities", b"float32[] remissions_"))
-    with Bag(path) as bag:
-        assert not bag.is_standard(LASER_SCAN)
+    assert b"float32 angle_min\nfloat32 angle_max\n" in data
+    swapped = data.replace(
+        b"float32 angle_min\nfloat32 angle_max\n", b"float32 angle_max\nfloat32 angle_min\n"
+    )
+    path.write_bytes(swapped)
+    with RosRecording(Bag(path)) as recording:
+        assert not recording.bag.is_standard(LASER_SCAN)
+        (message,) = recording.messages(recording.topics)
+        assert recording.scan(message).angle_min == 0.75
 
 
 def scan_with(**values):

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 
-from conversion.bags import Message
+from conversion.recordings import TransformSample
 from conversion.transforms import Transforms
+from conversion.wire import transforms_cdr
 from semantic2d_dataset.scene.geometry import rotation_matrix
 from tests.conversion.recordings import START_NS, Recording
 
@@ -15,11 +17,18 @@ SECOND = 10**9
 
 def tree(*edges) -> Transforms:
     """Edges are (topic, second, parent, child, xyz, rpy); recorded as stamped."""
-    recording, transforms = Recording("db3"), Transforms()
+    recording = Recording("db3")
     for topic, second, *rest in edges:
         recording.add_tf(START_NS + int(second * SECOND), *rest, topic=topic)
-    for topic, type_, record_ns, parsed in recording.messages:
-        transforms.add(Message(topic, type_, record_ns, b""), parsed)
+    return transforms_of(recording)
+
+
+def transforms_of(recording: Recording) -> Transforms:
+    transforms = Transforms()
+    for topic, type_, record_ns, message in recording.messages:
+        raw = bytes(recording.store.serialize_cdr(message, type_))
+        for sample in transforms_cdr(raw, static=topic == "/tf_static"):
+            transforms.add(sample, record_ns)
     return transforms
 
 
@@ -118,13 +127,12 @@ def test_a_robot_at_rest_has_poses_only_while_tf_says_so():
 
 
 def test_postdated_corrections_are_put_back_to_when_they_were_known():
-    recording, transforms = Recording("db3"), Transforms()
+    recording = Recording("db3")
     for n in range(21):
         ns = START_NS + n * SECOND // 10
         recording.add_tf(ns, "odom", "base", (0.1 * n, 0.0, 0.0))
         recording.add_tf(ns + SECOND, "map", "odom", (0.0, 0.1 * n, 0.0), record_ns=ns)
-    for topic, type_, record_ns, parsed in recording.messages:
-        transforms.add(Message(topic, type_, record_ns, b""), parsed)
+    transforms = transforms_of(recording)
     chain = ("map", "odom", "base")
     found, _, postdated = transforms.poses(chain, at(0.5, 1.25), "header", None)
     assert postdated == pytest.approx(1.0)
@@ -152,14 +160,32 @@ def test_transforms_that_are_not_finite_are_left_out():
 
 
 def test_a_mount_published_with_either_sign_of_its_quaternion_is_one_mount():
-    recording, transforms = Recording("db3"), Transforms()
+    recording = Recording("db3")
     for n in range(4):
         recording.add_tf(START_NS + n, "base_link", "laser", (0.1, 0.0, 0.2), (0.0, 0.0, 0.6))
         turn = recording.messages[-1][3].transforms[0].transform.rotation
         if n % 2:
             for name in "xyzw":
                 object.__setattr__(turn, name, -getattr(turn, name))
-    for topic, type_, record_ns, parsed in recording.messages:
-        transforms.add(Message(topic, type_, record_ns, b""), parsed)
+    transforms = transforms_of(recording)
     found = transforms.mount("base_link", "laser")
     np.testing.assert_allclose(found, (0.1, 0, 0.2, 0, 0, 0.6), atol=1e-12)
+
+
+def test_a_tree_of_many_edges_keeps_its_samples_aside(tmp_path, monkeypatch):
+    monkeypatch.setattr("conversion.spill.temporary_folder", lambda: str(tmp_path))
+    monkeypatch.setattr("conversion.spill._IN_MEMORY", 10_000)
+    transforms = Transforms()
+    edges = [("map", "odom"), ("odom", "base"), *(("base", f"joint {n}") for n in range(18))]
+    tracemalloc.start()
+    for n in range(2000):
+        stamp = START_NS + n * 10_000_000
+        for k, frames in enumerate(edges):
+            values = (0.001 * n * (k > 0), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+            transforms.add(TransformSample(stamp, *frames, values, static=False), stamp)
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used < 700_000  # of the 2.9 MB that the samples have
+    found, _, _ = transforms.poses(("map", "odom", "base"), at(10.005), "header", None)
+    np.testing.assert_allclose(found, [[1.0005, 0, 0]], atol=1e-9)
+    assert list(tmp_path.iterdir()) == []
