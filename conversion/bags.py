@@ -1,58 +1,52 @@
-"""Recordings of ROS 1 and ROS 2, whatever file holds them; the only module that knows rosbags."""
+"""Recordings of ROS 1 and ROS 2, whatever files hold them."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
-from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
-
+from conversion.bag_files import ROS1, bags_in, find_files, kind_of
+from conversion.definitions import Connection, Definitions, known_distros
+from conversion.merging import Stream, merge
+from conversion.recordings import Message, Topic
+from conversion.rosbag1 import Rosbag1
+from conversion.rosbag2 import Rosbag2
+from conversion.salvage import describe
+from conversion.wording import one_line, seconds
 from semantic2d_dataset.errors import RecordingError
+
+__all__ = ["ROSBAGS_VERSION", "Bag", "bags_in", "seconds"]
 
 Taken = TypeVar("Taken")
 
 ROSBAGS_VERSION = version("rosbags")
 
-_HEADER = "std_msgs/msg/Header"
 _MAX_STAMP_NS = 2**63 - 1
-_SUFFIXES = (".bag", ".db3", ".mcap")
-_SOURCES = (*_SUFFIXES, ".zstd", ".yaml")
-# First bytes of what people pass, and how to go on from there.
-_PACKED = {
-    b"PK\x03\x04": "a zip archive: unpack it, and give the bag that was in it",
-    b"\x1f\x8b": "gzip data: decompress it (gunzip), and give the bag that was in it",
-    b"BZh": "bzip2 data: decompress it (bunzip2), and give the bag that was in it",
-    b"\xfd7zXZ": "xz data: decompress it (unxz), and give the bag that was in it",
-    b"\x28\xb5\x2f\xfd": (
-        "zstd data: give the folder with its metadata.yaml, or decompress it (unzstd)"
-    ),
-}
-_ROS2_MAGIC = {b"SQLite format 3\x00": ".db3", b"\x89MCAP0\r\n": ".mcap"}
+_MAX_SHOWN = 3
 
 
-class Topic(NamedTuple):
-    """A topic of one type, and how many messages the recording says that it holds."""
+class BagFile(Protocol):
+    """One file of a recording, open for reading."""
 
-    name: str
-    type: str
-    messages: int
+    path: Path
+    connections: list[Connection]
 
+    @property
+    def start_ns(self) -> int:
+        """No message was recorded before."""
+        ...
 
-class Message(NamedTuple):
-    """One message as it was recorded."""
+    def messages(self, connections: Collection[Connection], start_ns: int) -> Iterator[Message]:
+        """Yield the messages of some connections by time, from `start_ns` on."""
+        ...
 
-    topic: str
-    type: str
-    record_ns: int
-    raw: bytes
+    def close(self) -> None:
+        """Close it."""
+        ...
 
 
 class Bag:
@@ -62,9 +56,21 @@ class Bag:
 
     Parameters
     ----------
+    paths
+        A ROS 1 ``.bag``, a ROS 2 ``.db3`` or ``.mcap`` (``.zstd`` too), or a folder with the
+        files of one recording; or several files of one recording.
+    distro
+        The release of ROS whose message definitions are used where the files have none, such as
+        ``humble``; None takes what metadata.yaml says, else Humble, for ROS 1 Noetic.
+
+    Attributes
+    ----------
     path
-        A ROS 1 ``.bag``, a ROS 2 ``.db3`` or ``.mcap``, or the folder with their
-        ``metadata.yaml``.
+        The first path.
+    topics
+        Every topic, sorted by name.
+    notices
+        What had to be guessed.
 
     Raises
     ------
@@ -72,21 +78,28 @@ class Bag:
         If there is no such file or folder.
     RecordingError
         If it is no bag, or one that cannot be read.
+    InvalidInputError
+        If the release is not known.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
-        self.ros1 = _is_ros1(self.path)
-        self._standard = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
-        self._stores: dict[str, Typestore] = {}
+    def __init__(self, paths: Path | Sequence[Path], *, distro: str | None = None) -> None:
+        given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+        self.path = given[0]
+        found = find_files(given)
+        self.ros1 = _is_ros1(found.files)
+        self._files = [*found.files, *found.metadata]
+        self._open: list[BagFile] = []
         try:
-            self._reader: Reader1 | Reader2 = (Reader1 if self.ros1 else Reader2)(self.path)
-            self._reader.open()
-            self.topics = _topics_of(self._reader)
-        except PermissionError:
+            for path in found.files:
+                self._open.append(_open(path))
+            connections = [c for file in self._open for c in file.connections]
+            self.topics = _topics_of(connections)
+            told = found.distro if found.distro in known_distros(ros1=self.ros1) else None
+            self._definitions = Definitions(connections, ros1=self.ros1, distro=distro or told)
+        except BaseException:
+            self.close()
             raise
-        except Exception as err:
-            raise RecordingError(self.path, f"cannot be opened as a bag: {_cause(err)}") from err
+        self.notices = self._find_notices(given, None if distro or told else connections)
 
     def __enter__(self) -> Self:
         return self
@@ -97,34 +110,52 @@ class Bag:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._reader.close()
+        self.close()
+
+    def close(self) -> None:
+        """Close its files."""
+        while self._open:
+            self._open.pop().close()
 
     def of_type(self, types: Collection[str]) -> tuple[Topic, ...]:
         """Return the topics of one of these types."""
         return tuple(topic for topic in self.topics if topic.type in types)
 
-    def messages(self, topics: Collection[Topic]) -> Iterator[Message]:
-        """Yield the messages of some topics.
+    def messages(self, topics: Collection[Topic], start_ns: int = 0) -> Iterator[Message]:
+        """Yield the messages of some topics that were recorded at `start_ns` or later, by time.
 
         Raises
         ------
         RecordingError
             Where the recording is damaged, with the time that was reached.
         """
-        wanted = {(topic.name, topic.type) for topic in topics}
-        connections = [c for c in self._reader.connections if (c.topic, c.msgtype) in wanted]
-        if not connections:  # an empty selection means every topic to rosbags
-            return
-        last, read = "", 0
+        wanted = {(topic.name, topic.type): topic.messages for topic in topics}
+        last: Message | None = None
+        read, last_ns = 0, 0
         try:
-            for connection, record_ns, raw in self._reader.messages(connections):
-                _check_stamp(record_ns)
-                last = f" of {connection.topic} at {seconds(record_ns)}"
+            for message in self._merged(wanted, start_ns):
+                _, _, record_ns, raw = message
+                if type(record_ns) is not int or not last_ns <= record_ns <= _MAX_STAMP_NS:
+                    raise ValueError(  # noqa: TRY301
+                        f"the next, of {message.topic}, has the time {record_ns!r}"
+                    )
+                if type(raw) is not bytes:  # SQLite's columns take any type
+                    raise TypeError(f"the next, of {message.topic}, holds {raw!r}")  # noqa: TRY301
+                last, last_ns = message, record_ns
                 read += 1
-                yield Message(connection.topic, connection.msgtype, record_ns, raw)
+                yield message
+            expected = sum(wanted.values())
+            if start_ns == 0 and read < expected:
+                raise ValueError(f"expected {expected} messages of the chosen topics")  # noqa: TRY301
         except Exception as err:
-            after = f"after {read} messages, the last{last}" if read else "at its first message"
-            raise RecordingError(self.path, f"is damaged {after}: {_cause(err)}") from err
+            after = "at its first message"
+            if last is not None:
+                where = f"the last of {last.topic} at {seconds(last.record_ns)}"
+                after = f"after {read} messages, {where}"
+            path, cause = self.path, err
+            if isinstance(err, _DamagedFileError):
+                path, cause = err.path, err.cause
+            raise RecordingError(path, f"is damaged {after}: {one_line(cause)}") from cause
 
     def read(self, message: Message, take: Callable[[Any], Taken]) -> Taken:
         """Deserialise a message by the definition that the bag holds, else by ROS's own.
@@ -142,123 +173,106 @@ class Bag:
             If its bytes do not fit the definition, the type is unknown, or `take` fails.
         """
         try:
-            store = self._store_of(message.type)
+            store = self._definitions.store_of(message.type)
             deserialise = store.deserialize_ros1 if self.ros1 else store.deserialize_cdr
             return take(deserialise(message.raw, message.type))
         except Exception as err:
             raise RecordingError(
                 self.path,
                 f"{message.topic}: the message at {seconds(message.record_ns)} is no readable "
-                f"{message.type}: {_cause(err)}",
+                f"{message.type}: {one_line(err)}",
             ) from err
 
     def is_standard(self, type_: str) -> bool:
-        """Tell whether the bag means by a type, and by its header, what ROS means by it."""
-        try:
-            found = self._store_of(type_).fielddefs
-            known = self._standard.fielddefs
-            return all(found[name][1] == known[name][1] for name in (type_, _HEADER))
-        except Exception:  # rosbags fails in many ways on a definition that it cannot read
-            return False
+        """Tell whether the bag means by a type, and by all in it, what ROS means by it."""
+        return self._definitions.is_standard(type_)
 
-    def sources(self) -> list[dict[str, str | int]]:
-        """Return name, bytes and SHA-256 of the files that the recording consists of."""
-        files = [self.path]
-        if self.path.is_dir():
-            files = sorted(p for p in self.path.iterdir() if p.suffix in _SOURCES and p.is_file())
-        return [
-            {"name": file.name, "bytes": file.stat().st_size, "sha256": _sha256(file)}
-            for file in files
-        ]
+    def fields_of(self, type_: str) -> Mapping[str, Any]:
+        """Return rosbags' ``fielddefs`` of a type and of all in it, as the bag defines them.
 
-    def _store_of(self, type_: str) -> Typestore:
-        """Types as the bag defines them; only those that are read are ever compiled."""
-        if type_ not in self._stores:
-            texts = (
-                c.msgdef.data
-                for c in self._reader.connections
-                if c.msgtype == type_ and c.msgdef.format == MessageDefinitionFormat.MSG
+        Raises
+        ------
+        Exception
+            If the definition cannot be read (rosbags raises many kinds), or there is none.
+        """
+        fields: Mapping[str, Any] = self._definitions.store_of(type_).fielddefs
+        return fields
+
+    def files(self) -> list[Path]:
+        """Return the files that the recording consists of."""
+        return list(self._files)
+
+    def _merged(self, wanted: Collection[tuple[str, str]], start_ns: int) -> Iterator[Message]:
+        streams = []
+        read = _read_one_of_many if len(self._open) > 1 else _read
+        for file in self._open:
+            chosen = [c for c in file.connections if (c.topic, c.type) in wanted]
+            if chosen:  # an empty selection means every topic to rosbags
+                streams.append(Stream(file.start_ns, partial(read, file, chosen, start_ns)))
+        return merge(streams)
+
+    def _find_notices(
+        self, given: Sequence[Path], guessed: Collection[Connection] | None
+    ) -> tuple[str, ...]:
+        notices = []
+        if len(self._open) > len(given) and len(self._files) == len(self._open):
+            names = ", ".join(path.name for path in self._files[:_MAX_SHOWN])
+            notices.append(f"{len(self._open)} files taken as one recording: {names}")
+        bare = {c.type for c in guessed or () if not c.definition.strip()}
+        if bare:
+            notices.append(
+                f"the recording defines {len(bare)} of its types nowhere: those of ROS "
+                f"{self._definitions.distro} are used; --distro names another release"
             )
-            text = next((text for text in texts if text.strip()), None)
-            store = self._standard
-            if text is not None:
-                store = get_typestore(Stores.EMPTY)
-                store.register(get_types_from_msg(text, type_))
-            self._stores[type_] = store
-        return self._stores[type_]
+        return tuple(notices)
 
 
-def seconds(stamp_ns: int) -> str:
-    """Write a stamp as seconds, to the millisecond."""
-    return f"{stamp_ns // 10**9}.{stamp_ns // 10**6 % 1000:03d} s"
+class _DamagedFileError(Exception):
+    """One of several files is damaged."""
+
+    def __init__(self, path: Path, cause: Exception) -> None:
+        super().__init__(path, cause)
+        self.path = path
+        self.cause = cause
 
 
-def _topics_of(reader: Reader1 | Reader2) -> tuple[Topic, ...]:
-    counts: dict[tuple[str, str], int] = {}
-    for connection in reader.connections:
-        key = (connection.topic, connection.msgtype)
-        counts[key] = counts.get(key, 0) + connection.msgcount
-    return tuple(Topic(*key, count) for key, count in sorted(counts.items()))
+def _read(file: BagFile, chosen: Collection[Connection], start_ns: int) -> Iterator[Message]:
+    return file.messages(chosen, start_ns)
 
 
-def _is_ros1(path: Path) -> bool:
-    """Tell ROS 1 from ROS 2 by the first bytes; refuse what is neither."""
-    if path.is_dir():
-        _check_folder(path)
-        return False
-    with path.open("rb") as file:  # FileNotFoundError and PermissionError pass as they are
-        head = file.read(64)
-    if not head:
-        raise RecordingError(path, "the file is empty")
-    if head.startswith(b"#ROSBAG V2.0"):
-        return True
-    _check_version(path, head)
-    for magic, advice in _PACKED.items():
-        if head.startswith(magic):
-            raise RecordingError(path, f"expected a bag, found {advice}")
-    for magic, suffix in _ROS2_MAGIC.items():
-        if head.startswith(magic):
-            if path.suffix != suffix:
-                raise RecordingError(
-                    path, f"this is a ROS 2 bag whose name must end with {suffix}: rename it"
-                )
-            return False
-    raise RecordingError(
-        path,
-        f"not a ROS bag: expected a ROS 1 .bag, or a ROS 2 .db3, .mcap or folder, found a file "
-        f"that starts with {head[:16]!r}",
-    )
+def _read_one_of_many(
+    file: BagFile, chosen: Collection[Connection], start_ns: int
+) -> Iterator[Message]:
+    try:
+        yield from file.messages(chosen, start_ns)
+    except Exception as err:
+        raise _DamagedFileError(file.path, err) from err
 
 
-def _check_version(path: Path, head: bytes) -> None:
-    if head.startswith((b"#ROSBAG", b"#ROSRECORD", b"#ROSLOG")):
-        line = head.splitlines()[0].decode("ascii", "replace")
+def _is_ros1(files: Sequence[Path]) -> bool:
+    kinds = [kind_of(path) for path in files]
+    for path, kind in zip(files, kinds, strict=True):
+        if (kind == ROS1) != (kinds[0] == ROS1):
+            raise RecordingError(
+                path, f"is a bag of another ROS than {files[0].name}: convert them one by one"
+            )
+    return kinds[0] == ROS1
+
+
+def _open(path: Path) -> BagFile:
+    try:
+        return Rosbag1(path) if kind_of(path) == ROS1 else Rosbag2(path)
+    except (PermissionError, RecordingError):
+        raise
+    except Exception as err:
         raise RecordingError(
-            path,
-            f"expected a bag of version 2.0, found {line!r}: convert it with ROS 1 "
-            "(rosbag fix OLD.bag NEW.bag)",
-        )
+            path, f"cannot be opened as a bag: {one_line(err)}; {describe(path)}"
+        ) from err
 
 
-def _check_folder(path: Path) -> None:
-    if (path / "metadata.yaml").is_file():
-        return
-    bags = sorted(p.name for p in path.iterdir() if p.suffix in _SUFFIXES)
-    advice = f"give one of its bags: {', '.join(bags[:8])}" if bags else "it holds no bag"
-    raise RecordingError(path, f"a folder without metadata.yaml is no ROS 2 recording; {advice}")
-
-
-def _check_stamp(record_ns: int) -> None:
-    if not 0 <= record_ns <= _MAX_STAMP_NS:
-        raise ValueError(f"a message has the record time {record_ns}")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _cause(err: Exception) -> str:
-    """Name a failure of rosbags or of what it rests on, in one line."""
-    text = " ".join(str(err).split())
-    return f"{type(err).__name__}{': ' + text if text else ''}"
+def _topics_of(connections: Collection[Connection]) -> tuple[Topic, ...]:
+    counts: dict[tuple[str, str], int] = {}
+    for connection in connections:
+        key = (connection.topic, connection.type)
+        counts[key] = counts.get(key, 0) + connection.messages
+    return tuple(Topic(*key, count) for key, count in sorted(counts.items()))
