@@ -1,0 +1,1 @@
+"""Any other arrays, by a description of what they mean."""
