@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from conversion.blocks import Arrays
-from conversion.plan import Plan
+from conversion.plan import Arrays, SequencePlan
 from semantic2d_dataset.scene.lidars import LidarSpec
 
 # Where intensity is zero wherever there is no return, in one order of the beams only:
@@ -28,7 +27,9 @@ class Tally:
     _agreements: NDArray[np.int64] = field(default_factory=lambda: np.zeros(3, np.int64))
 
     def add(self, arrays: Arrays) -> None:
-        """Count a block."""
+        """Count a block; those without scans (streams) count nothing."""
+        if "scans/ranges" not in arrays:
+            return
         ranges, intensities = arrays["scans/ranges"], arrays.get("scans/intensities")
         self.scans += len(ranges)
         kinds = {
@@ -100,25 +101,24 @@ class Summary:
     suggestions: tuple[str, ...]
 
     @classmethod
-    def of(cls, file: str, sequence_id: str, plan: Plan, tally: Tally) -> Summary:
+    def of(cls, file: str, plan: SequencePlan, tally: Tally) -> Summary:
         """Gather what is known after a conversion."""
-        stamps = plan.found.stamps_ns
         return cls(
             file=file,
-            sequence_id=sequence_id,
-            topic=plan.topic.name,
-            frame=plan.found.beams.frame,
-            lidar=plan.lidar.name,
-            beams=plan.lidar.beams,
-            scans_in=len(stamps),
+            sequence_id=plan.header.sequence_id,
+            topic=plan.topic,
+            frame=plan.frame,
+            lidar=plan.header.lidar.name,
+            beams=plan.header.lidar.beams,
+            scans_in=plan.scans_in,
             scans_out=tally.scans,
-            duration_s=float(stamps[-1] - stamps[0]) / 1e9,
-            pose_source=plan.poses.source,
-            pose_max_gap_s=plan.poses.max_gap_s,
-            scans_with_pose=int(plan.poses.known.sum()),
+            duration_s=plan.duration_s,
+            pose_source=plan.pose_source,
+            pose_max_gap_s=plan.pose_max_gap_s,
+            scans_with_pose=plan.scans_with_pose,
             beam_shares=tally.shares,
             intensities=tally.intensity_kind,
-            mount=plan.lidar.base_T_lidar,
+            mount=plan.header.lidar.base_T_lidar,
             notices=plan.notices,
             suggestions=_suggestions(plan, tally),
         )
@@ -128,10 +128,13 @@ class Summary:
         return asdict(self)
 
     def __str__(self) -> str:
+        share = self.scans_with_pose / max(1, self.scans_in)
         gap = "" if self.pose_max_gap_s is None else f", gaps up to {self.pose_max_gap_s:.2f} s"
         scans = f"{self.scans_out} of {self.scans_in} of {self.topic}, {self.duration_s:.1f} s"
-        poses = f"{self.scans_with_pose / self.scans_in:.1%}, from {self.pose_source}{gap}"
+        poses = f"{share:.1%}, from {self.pose_source}{gap}"
+        poses = "no source" if self.pose_source == "none" else poses
         shares = ", ".join(f"{name} {share:.1%}" for name, share in self.beam_shares.items())
+        frame = f"frame {self.frame!r}, " if self.frame else ""
         mount = " ".join(f"{value:.4g}" for value in self.mount)
         lines = [
             f"{self.file}: {self.sequence_id}",
@@ -139,14 +142,14 @@ class Summary:
             f"  poses      {self.scans_with_pose} of {self.scans_in} scans ({poses})",
             f"  beams      {shares}",
             f"  intensity  {self.intensities}",
-            f"  lidar      {self.lidar}, {self.beams} beams, frame {self.frame!r}, mount {mount}",
+            f"  lidar      {self.lidar}, {self.beams} beams, {frame}mount {mount}",
         ]
         lines += [f"  note       {text}" for text in self.notices]
         lines += [f"  suggestion {text}" for text in self.suggestions]
         return "\n".join(lines)
 
 
-def _suggestions(plan: Plan, tally: Tally) -> tuple[str, ...]:
+def _suggestions(plan: SequencePlan, tally: Tally) -> tuple[str, ...]:
     if not tally.intensities_run_backward:
         return ()
     action = "drop" if plan.reverse_intensities else "pass"

@@ -230,11 +230,27 @@ def plot(
 
 
 @app.command(context_settings=_FORWARDED, add_help_option=False)
+def inspect(context: typer.Context) -> None:
+    """Say what a recording holds, and how it would be converted."""
+    _forward_conversion("inspect", context.args)
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
 def convert(context: typer.Context) -> None:
-    """Convert a recording (ROS 1 or ROS 2 bag) into a sequence."""
-    command = typer.Typer(add_completion=False, rich_markup_mode=None)
-    command.command(name="convert")(load_sibling("conversion").convert)
-    _forward(command, "convert", context.args)
+    """Convert recordings (ROS bags, CARMEN logs, published layouts, arrays) into sequences."""
+    _forward_conversion("convert", context.args)
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
+def audit(context: typer.Context) -> None:
+    """Count what is wrong in data of the published layout."""
+    _forward_conversion("audit", context.args)
+
+
+@app.command(context_settings=_FORWARDED, add_help_option=False)
+def export(context: typer.Context) -> None:
+    """Write a sequence as a ROS 2 recording, or in the published layout."""
+    _forward_conversion("export", context.args)
 
 
 @app.command(context_settings=_FORWARDED, add_help_option=False)
@@ -278,6 +294,12 @@ def load_sibling(package: str) -> ModuleType:
             "that one, or take it off PYTHONPATH"
         )
     return importlib.import_module(f"{package}.cli")
+
+
+def _forward_conversion(name: str, words: Sequence[str]) -> None:
+    command = typer.Typer(add_completion=False, rich_markup_mode=None)
+    command.command(name=name)(getattr(load_sibling("conversion"), name))
+    _forward(command, name, words)
 
 
 def _forward(command: typer.Typer, name: str, words: Sequence[str]) -> None:

@@ -27,7 +27,7 @@ def test_the_summary_says_what_was_found_and_guessed(tmp_path):
     assert "scans      12 of 12 of /scan" in result.stdout
     assert "11 of 12 scans (91.7%, from tf map -> odom -> base_link" in result.stdout
     assert "intensity  measured" in result.stdout
-    assert "note       mount tf" in result.stdout
+    assert "note       mount from tf" in result.stdout
 
 
 def test_the_json_summary_is_for_programs_and_options_arrive(tmp_path):
@@ -37,7 +37,9 @@ def test_the_json_summary_is_for_programs_and_options_arrive(tmp_path):
         "--environment", "lab", "--recording-name", "day.1", "--license", "MIT", "--max-gap", 2,
     )  # fmt: skip
     assert result.exit_code == 0
-    found = json.loads(result.stdout)
+    (outcome,) = json.loads(result.stdout)
+    assert (outcome["recording"], outcome["error"]) == (str(path), None)
+    (found,) = outcome["sequences"]
     assert (found["scans_in"], found["scans_out"]) == (12, 11)
     assert found["sequence_id"] == "lab--day.1--scan-8"
     assert (found["mount"], found["pose_max_gap_s"]) == ([1, 2, 3, 0, 0, 0.5], 2)
@@ -68,9 +70,30 @@ def test_a_failed_conversion_keeps_the_file_that_was_there(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.bag", "out.h5"]
 
 
-def test_a_folder_is_no_output(tmp_path):
-    result = run(straight_drive("db3").write(tmp_path), "--out", tmp_path)
-    assert isinstance(result.exception, InvalidInputError)
+def test_a_folder_of_bags_is_converted_and_what_fails_is_told_at_the_end(tmp_path):
+    bags = tmp_path / "bags"
+    bags.mkdir()
+    for name in ("a", "b"):
+        straight_drive("ros1").write(bags, name)
+    (bags / "c.bag").write_bytes(b"no bag")
+    result = run(bags, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert f"error: {bags / 'c.bag'}: not a ROS bag" in result.stderr
+    assert "1 of 3 recordings could not be converted" in result.stderr
+    assert result.stdout.count("12 of 12 of /scan") == 2
+    assert len(list((tmp_path / "out").iterdir())) == 2
+    again = run(bags / "a.bag", bags / "b.bag", "--out", tmp_path / "out")
+    assert again.exit_code == 0
+    assert again.stdout.count("complete already, 12 scans: kept") == 2
+
+
+def test_files_of_one_recording_are_merged_on_request(tmp_path):
+    first, second = straight_drive("ros1"), straight_drive("ros1", scans=20)
+    second.messages = [m for m in second.messages if m[2] > first.messages[-1][2]]
+    paths = [first.write(tmp_path, "morning"), second.write(tmp_path, "noon")]
+    result = run(*paths, "--merge", "--out", tmp_path / "out.h5")
+    assert "scans      20 of 20 of /scan" in result.stdout
+    assert "19 of 20 scans" in result.stdout
 
 
 @pytest.mark.parametrize("text", ["", "1,2,3", "1,2,3,4,5,six", "1,2,3,4,5,6,7"])
