@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 
 from semantic2d_dataset.errors import CorruptFileError
 from semantic2d_dataset.format import writer_process
-from semantic2d_dataset.format.chunks import count_cores, fletcher32, is_intact, pack, pack_in_order
+from semantic2d_dataset.format.chunks import (
+    count_cores,
+    deflate,
+    fletcher32,
+    is_intact,
+    pack,
+    pack_in_order,
+)
 from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.schema import SCHEMAS
 
@@ -195,6 +202,36 @@ def test_checksum_is_that_of_hdf5(data):
 def test_checksum_of_the_largest_chunk_is_that_of_hdf5():
     data = np.random.default_rng(0).bytes((1 << 24) - 1)
     assert fletcher32(data) == checksum_by_hdf5(data)
+
+
+def scans(kind):
+    """Ranges (64, 1081) of a lidar that sees noise, stands still, drives off, or sees nothing."""
+    rng, shape = np.random.default_rng(0), (64, 1081)
+    room = 5 + 3 * np.sin(np.linspace(0, 9, 1081))
+    values = {
+        "noisy": room + rng.normal(0, 0.02, shape),
+        "rounded": np.round(room + rng.normal(0, 0.02, shape), 3),
+        "still": np.broadcast_to(room, shape),
+        "leaving": room + np.maximum(0, np.arange(64)[:, None] - 50) * rng.normal(0, 0.02, shape),
+        "arriving": room + np.maximum(0, 14 - np.arange(64)[:, None]) * rng.normal(0, 0.02, shape),
+        "nothing": np.full(shape, np.inf),
+    }
+    return values[kind].astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["noisy", "rounded", "still", "leaving", "arriving", "nothing"])
+def test_planes_apart_are_as_small_as_together(kind):
+    planes = scans(kind).reshape(-1, 1).view(np.uint8).T.copy()
+    ours, plain = deflate(planes), zlib.compress(planes, 4)
+    assert zlib.decompress(ours) == planes.tobytes()
+    assert len(ours) <= 1.02 * len(plain) + 100  # of 276,736
+
+
+@pytest.mark.parametrize("bytes_", [8191, 8192, 70_000])
+@pytest.mark.parametrize("planes", [1, 2, 8])
+def test_planes_of_any_number_and_length_inflate(planes, bytes_):
+    noise = np.random.default_rng(0).integers(0, 5, (planes, bytes_), dtype=np.uint8)
+    assert zlib.decompress(deflate(noise)) == noise.tobytes()
 
 
 def test_chunks_keep_their_order():

@@ -130,10 +130,10 @@ FAIL_IN_A_THREAD = textwrap.dedent(
     """
     import threading, zlib
     compress = zlib.compress
-    def fail(data, level=-1):
+    def fail(*args):
         if threading.current_thread() is not threading.main_thread():
             raise zlib.error("Error -4 while compressing data: insufficient memory")
-        return compress(data, level)
+        return compress(*args)
     zlib.compress = fail
     """
 )
