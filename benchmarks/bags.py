@@ -26,8 +26,8 @@ from rosbags.highlevel import AnyReader
 PROJECT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(PROJECT))
 
-from conversion.bags import Bag  # noqa: E402
-from conversion.ros import RosRecording  # noqa: E402
+from conversion.ros.bags import Bag  # noqa: E402
+from conversion.ros.recording import RosRecording  # noqa: E402
 from tests.conversion.recordings import KINDS, ODOMETRY, START_NS, TF, Recording  # noqa: E402
 
 BEAMS = 1081

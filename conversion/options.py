@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from conversion.transforms import Mount
+from conversion.messages.transforms import Mount
 from semantic2d_dataset.errors import InvalidInputError
 
 STAMPS = ("auto", "header", "record")
@@ -28,7 +28,7 @@ class Options:
     clock_offset_s
         Added to the stamps of a pose file, s.
     map_frame, max_gap_s
-        Where poses come from, as `conversion.poses.PoseRequest`.
+        Where poses come from, as `conversion.messages.poses.PoseRequest`.
     base_frame
         The robot's frame; None takes base_link or base_footprint.
     mount

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from conversion.bags import Bag, bags_in
 from conversion.carmen.log import CarmenLog, is_carmen
 from conversion.exports.exported import ExportedSource, is_exported
 from conversion.layouts.ogm import OgmSource, is_ogm
 from conversion.layouts.release import ReleaseSource
 from conversion.layouts.sessions import is_release
 from conversion.layouts.trees import is_archive, open_tree
-from conversion.message_source import MessageSource
+from conversion.messages.source import MessageSource
 from conversion.options import Options
 from conversion.plan import Source
 from conversion.presets import OGM
-from conversion.ros import RosRecording
+from conversion.ros.bags import Bag, bags_in
+from conversion.ros.recording import RosRecording
 from conversion.tables.table import TableSource, is_table
 from semantic2d_dataset.errors import RecordingError
 

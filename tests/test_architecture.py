@@ -66,7 +66,7 @@ def test_imports_follow_the_architecture(path):
 @pytest.mark.parametrize(
     ("path", "imported"),
     [
-        ("salsa/alignment.py", "conversion.bags"),
+        ("salsa/alignment.py", "conversion.ros.bags"),
         ("semantic2d_dataset/format/sequence.py", "semantic2d_dataset.access.registry"),
         ("semantic2d_dataset/access/registry.py", "salsa"),
         ("semantic2d_dataset/scoring/metrics.py", "torch"),

@@ -27,10 +27,10 @@ from conversion.carmen.lines import (
     read_parameter,
     split_line,
 )
+from conversion.messages.recordings import Message, PoseSample, Topic, TransformSample
+from conversion.messages.scans import Scan
+from conversion.messages.tracks import Values
 from conversion.plan import Arrays
-from conversion.recordings import Message, PoseSample, Topic, TransformSample
-from conversion.scans import Scan
-from conversion.tracks import Values
 from semantic2d_dataset.errors import RecordingError
 
 BASE, MAP, ODOMETRY = "base_link", "map", "odom"
@@ -50,7 +50,7 @@ _EPOCH_NS = 10**17  # 1973; stamps below count from the start of the logger
 
 
 class CarmenLog:
-    """A CARMEN log, plain or gzip, as a `conversion.recordings.Recording`.
+    """A CARMEN log, plain or gzip, as a `conversion.messages.recordings.Recording`.
 
     Each kind of laser line (FLASER, RLASER, RAWLASER1 to 4, ROBOTLASER1 and 2) is a topic of
     scans, and its poses are a topic named ``<kind> pose``, in the frame ``map``; all other lines

@@ -34,10 +34,10 @@ from conversion.exports.mcap_messages import (
     POINT_CLOUD,
     STRING,
 )
+from conversion.messages.recordings import Message, Recording, Topic
 from conversion.options import Options
 from conversion.plan import BLOCK, Arrays, SequencePlan
-from conversion.recordings import Message, Recording, Topic
-from conversion.ros import RosRecording
+from conversion.ros.recording import RosRecording
 from semantic2d_dataset.errors import InvalidInputError, RecordingError
 from semantic2d_dataset.format.container import load_json
 from semantic2d_dataset.format.schema import SEQUENCE

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from conversion.inspection.findings import PoseReport, ScanReport, Suggestion
 from conversion.inspection.holdings import Holdings
+from conversion.messages.poses import AUTO
 from conversion.options import Options
 from conversion.plan import SequencePlan
-from conversion.poses import AUTO
 
 _FEW = 0.5  # of the scans with a pose: below that other sources are proposed
 _PARTS = 2  # of a topic: more are rather a logger's fault than a clock that was set

@@ -20,13 +20,13 @@ from conversion.inspection.observation import Key, Observation, observe
 from conversion.inspection.pose_sources import PoseSource, PoseSources, longest_gap_s
 from conversion.inspection.scan_probe import ScanProbe
 from conversion.inspection.timelines import Timeline
-from conversion.lidars import place_lidar
+from conversion.messages.lidars import place_lidar
+from conversion.messages.parts import choose_stamps
+from conversion.messages.poses import AUTO, pose_topics
+from conversion.messages.recordings import Recording, Topic
+from conversion.messages.scans import Beams
 from conversion.options import Options
-from conversion.parts import choose_stamps
 from conversion.plan import Arrays, SequencePlan
-from conversion.poses import AUTO, pose_topics
-from conversion.recordings import Recording, Topic
-from conversion.scans import Beams
 from semantic2d_dataset.errors import RecordingError
 
 Rates = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -9,7 +9,7 @@ from conversion.inspection.advice import advise, command_line
 from conversion.inspection.findings import Inspection, PlanReport
 from conversion.inspection.holdings import Holdings, of_arrays, of_messages
 from conversion.inspection.scan_timing import iso
-from conversion.message_source import MessageSource
+from conversion.messages.source import MessageSource
 from conversion.options import Options
 from conversion.plan import SequencePlan, Source
 from semantic2d_dataset.errors import InvalidInputError, RecordingError

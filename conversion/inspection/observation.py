@@ -10,13 +10,13 @@ from functools import partial
 from conversion.inspection.pose_sources import TransformTimes
 from conversion.inspection.scan_probe import ScanProbe
 from conversion.inspection.timelines import Timeline
-from conversion.lidars import choose_lidar
+from conversion.messages.lidars import choose_lidar
+from conversion.messages.poses import PoseLog
+from conversion.messages.recordings import Message, Recording
+from conversion.messages.survey import Survey, with_progress
+from conversion.messages.transforms import Transforms
+from conversion.messages.velocities import VelocityLog
 from conversion.options import Options
-from conversion.poses import PoseLog
-from conversion.recordings import Message, Recording
-from conversion.survey import Survey, with_progress
-from conversion.transforms import Transforms
-from conversion.velocities import VelocityLog
 from semantic2d_dataset.errors import RecordingError
 
 Key = tuple[str, str]

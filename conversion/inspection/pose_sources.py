@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from conversion.inspection.findings import PoseReport, TransformReport
 from conversion.inspection.timelines import Timeline
+from conversion.messages.pose_files import LIDAR, read_pose_file
+from conversion.messages.poses import AUTO, NONE, TF
+from conversion.messages.recordings import Topic, TransformSample
+from conversion.messages.survey import ScanLog, Survey
+from conversion.messages.tracks import Track, default_gap_s
 from conversion.options import Options
-from conversion.pose_files import LIDAR, read_pose_file
-from conversion.poses import AUTO, NONE, TF
-from conversion.recordings import Topic, TransformSample
-from conversion.survey import ScanLog, Survey
-from conversion.tracks import Track, default_gap_s
 from semantic2d_dataset.errors import RecordingError
 
 _DRAWN = 4000  # poses of a source that are kept to be drawn

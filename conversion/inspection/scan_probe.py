@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from conversion.inspection.findings import SampleScan, ScanReport, StampReport
 from conversion.inspection.scan_statistics import ScanStatistics
 from conversion.inspection.scan_timing import Timing, report_stamps, timing_oddities
+from conversion.messages.recordings import Message, Recording, Topic
+from conversion.messages.scans import Beams, Scan
+from conversion.messages.survey import ScanLog, is_scan
 from conversion.plan import BLOCK
-from conversion.recordings import Message, Recording, Topic
-from conversion.ros import RosRecording
-from conversion.scans import Beams, Scan
+from conversion.ros.recording import RosRecording
 from conversion.summary import Tally
-from conversion.survey import ScanLog, is_scan
 from semantic2d_dataset.errors import Semantic2DError
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import UNLABELLED

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from conversion.inspection.findings import StampReport
-from conversion.scans import Beams
-from conversion.survey import ScanLog
+from conversion.messages.scans import Beams
+from conversion.messages.survey import ScanLog
 
 _MISSING_FROM = 1.5  # periods: from there on a gap lacks scans
 _NEAR, _STEADY = 0.2, 0.6  # this share of gaps near the median: else nothing can be missing

@@ -23,9 +23,9 @@ from conversion.layouts.rows import (
     to_ranges,
 )
 from conversion.layouts.trees import open_tree
+from conversion.messages.poses import NONE
 from conversion.options import Options
 from conversion.plan import BLOCK, Arrays, SequencePlan
-from conversion.poses import NONE
 from semantic2d_dataset.errors import RecordingError
 from semantic2d_dataset.format.sequence import SequenceHeader, slug
 from semantic2d_dataset.format.splits import NONE as IN_NO_SPLIT

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from conversion.layouts.fields import SCANS
 from conversion.layouts.sessions import Session
-from conversion.lidars import place_lidar
+from conversion.messages.lidars import place_lidar
 from conversion.options import Options
 from semantic2d_dataset.errors import RecordingError
 from semantic2d_dataset.scene.lidars import LIDARS, LidarSpec, find_lidar, read_lidar

@@ -12,7 +12,7 @@ from typing import TextIO
 import numpy as np
 from tqdm import tqdm
 
-from conversion.pose_files import nanoseconds
+from conversion.messages.pose_files import nanoseconds
 from conversion.tables.rows import Contents, Rows, Selector
 from semantic2d_dataset.errors import RecordingError
 

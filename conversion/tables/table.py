@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conversion.layouts.rows import SYNTHETIC_STEP_NS, only_finite, refuse_options, to_ranges
+from conversion.messages.pose_files import poses_at_scans, read_pose_file
+from conversion.messages.poses import NONE, FoundPoses
 from conversion.options import Options
 from conversion.plan import BLOCK, Arrays, SequencePlan
-from conversion.pose_files import poses_at_scans, read_pose_file
-from conversion.poses import NONE, FoundPoses
 from conversion.tables.arrays import ArrayRows, FolderStore, NpzStore
 from conversion.tables.csv_rows import CsvRows
 from conversion.tables.layout import TableLayout, example_description, read_layout

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conversion.bags import Bag
 from conversion.convert import Kept, convert_recording
-from conversion.message_source import MessageSource
+from conversion.messages.source import MessageSource
 from conversion.options import Options
-from conversion.ros import RosRecording
+from conversion.ros.bags import Bag
+from conversion.ros.recording import RosRecording
 from conversion.summary import Summary
 from semantic2d_dataset.errors import InvalidInputError, RecordingError
 from semantic2d_dataset.format.sequence import SequenceReader

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from conversion.carmen.log import CarmenLog, is_carmen
-from conversion.message_source import MessageSource
+from conversion.messages.source import MessageSource
 from conversion.options import Options
 from semantic2d_dataset.errors import RecordingError
 from semantic2d_dataset.scene.geometry import to_points, transform

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from conversion.bags import Bag
 from conversion.exports.exported import ExportedSource
 from conversion.options import Options
-from conversion.ros import RosRecording
+from conversion.ros.bags import Bag
+from conversion.ros.recording import RosRecording
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceWriter
 from semantic2d_dataset.scene.geometry import Pose2
 from semantic2d_dataset.scene.lidars import LidarSpec

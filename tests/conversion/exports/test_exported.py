@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from conversion.bags import Bag
 from conversion.exports.exported import is_exported
 from conversion.exports.mcap import END_TOPIC, SEQUENCE_TOPIC, export_mcap
 from conversion.options import Options
 from conversion.plan import BLOCK
-from conversion.ros import RosRecording
+from conversion.ros.bags import Bag
+from conversion.ros.recording import RosRecording
 from semantic2d_dataset.errors import InvalidInputError, RecordingError
 from semantic2d_dataset.format.schema import SEQUENCE
 from semantic2d_dataset.format.sequence import SequenceReader

@@ -12,13 +12,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from conversion.bags import Bag
 from conversion.cli import convert
 from conversion.inspection.inspection import inspect_source
 from conversion.inspection.plot import plot_inspection
-from conversion.message_source import MessageSource
+from conversion.messages.source import MessageSource
 from conversion.options import Options
-from conversion.ros import RosRecording
+from conversion.ros.bags import Bag
+from conversion.ros.recording import RosRecording
 from semantic2d_dataset.format.sequence import SequenceReader
 from tests.conversion.recordings import (
     AMCL,

@@ -1,9 +1,9 @@
 """One look at all messages of a recording."""
 
-from conversion.bags import Bag
 from conversion.inspection.observation import observe
 from conversion.options import Options
-from conversion.ros import RosRecording
+from conversion.ros.bags import Bag
+from conversion.ros.recording import RosRecording
 from tests.conversion.inspection.test_inspection import TENTH, office
 from tests.conversion.recordings import LASER, START_NS, STRING
 

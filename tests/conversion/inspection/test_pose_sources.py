@@ -3,7 +3,7 @@
 import pytest
 
 from conversion.inspection.pose_sources import TransformTimes
-from conversion.recordings import TransformSample
+from conversion.messages.recordings import TransformSample
 from tests.conversion.inspection.test_inspection import TENTH, inspect
 from tests.conversion.recordings import START_NS, Recording
 

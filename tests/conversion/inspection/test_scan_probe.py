@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from conversion.inspection.scan_probe import SAMPLES, ScanProbe
-from conversion.lidars import choose_lidar
+from conversion.messages.lidars import choose_lidar
+from conversion.messages.recordings import Topic
+from conversion.messages.scans import Scan
 from conversion.plan import BLOCK
-from conversion.recordings import Topic
-from conversion.scans import Scan
 
 NOTHING = np.zeros(0, np.float32)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from conversion.inspection.scan_timing import Timing, iso, report_stamps, timing_oddities
-from conversion.recordings import Topic
-from conversion.scans import Beams, Scan
-from conversion.survey import ScanLog
+from conversion.messages.recordings import Topic
+from conversion.messages.scans import Beams, Scan
+from conversion.messages.survey import ScanLog
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
