@@ -30,9 +30,9 @@ demo: $(SETUP)
 test: $(SETUP)
 	$(BIN)/pytest -n 2 -m 'not long'
 
-# Hundreds of kills and flips, sixteen workers, a wheel in an empty environment.
+# Thousands of kills, cuts and flips, sixteen workers, a Dask cluster, a wheel by itself.
 test-long: $(SETUP)
-	$(BIN)/pytest -m long
+	$(BIN)/pytest -n 2 -m long
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
