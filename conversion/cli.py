@@ -64,7 +64,10 @@ ReverseIntensities = Annotated[
 Preset = Annotated[str | None, typer.Option(help="A known data set: stata, ogm-turtlebot2.")]
 Distro = Annotated[
     str | None,
-    typer.Option(help="ROS release whose messages a bag without definitions holds.  [default: as it says, else humble]"),
+    typer.Option(
+        help="ROS release whose messages a bag without definitions holds.  "
+        "[default: as it says, else humble]"
+    ),
 ]
 Merge = Annotated[bool, typer.Option("--merge", help="The files given are parts of one recording.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]

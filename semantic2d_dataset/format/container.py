@@ -247,12 +247,6 @@ class ContainerReader:
                 raise UnsafeFileError(f"{where} is larger than {MAX_ATTRIBUTE_BYTES} bytes")
 
 
-def check_container(path: Path, schema: FileSchema) -> None:
-    """Open a file under a schema and read all of it; raises as `ContainerReader` does."""
-    with ContainerReader(path, schema) as reader:
-        reader.read_everything()
-
-
 def kind_of(path: Path) -> str:
     """Return the kind that a file says it is of, "" where it says nothing; trust nothing else."""
     try:

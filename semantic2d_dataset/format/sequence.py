@@ -178,10 +178,8 @@ class SequenceWriter:
         if width is not None and array.shape[1:] != width:
             raise InvalidInputError(f"{where}: expected {('n', *width)}, found {array.shape}")
         if name == "scans/stamps_ns" and array.size:
-            steps = np.diff(
-                array, prepend=array[0] if self._last_stamp is None else self._last_stamp
-            )
-            if (steps < 0).any():
+            late = self._last_stamp is not None and array[0] < self._last_stamp
+            if late or _goes_backward(array):
                 raise InvalidInputError(f"{where}: stamps go backward; split the recording there")
             self._last_stamp = int(array[-1])
 
@@ -344,7 +342,7 @@ class SequenceReader:
             lines do not divide their segments.
         """
         self._container.read_everything()
-        if (np.diff(self.read("scans/stamps_ns")) < 0).any():
+        if _goes_backward(self.read("scans/stamps_ns")):
             raise CorruptFileError(f"{self.path}: scans/stamps_ns go backward")
         for block in self._container.blocks("scans/labels") if "scans/labels" in self else ():
             strange = (block >= len(self.header.taxonomy)) & (block != UNLABELLED)
@@ -405,6 +403,11 @@ class SequenceReader:
         except InvalidInputError as err:
             raise CorruptFileError(str(err)) from err
         return shapes["scans/stamps_ns"][0]
+
+
+def _goes_backward(stamps_ns: NDArray[np.int64]) -> bool:
+    """Compare, not subtract: differences of stamps may be beyond int64."""
+    return bool((stamps_ns[1:] < stamps_ns[:-1]).any())
 
 
 def _check_lengths(path: Path, rows: Mapping[str, int]) -> None:

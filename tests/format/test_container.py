@@ -13,7 +13,7 @@ from semantic2d_dataset.errors import (
     Semantic2DError,
     UnsafeFileError,
 )
-from semantic2d_dataset.format.container import ContainerReader, check_container
+from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.schema import SEQUENCE
 from semantic2d_dataset.format.sequence import SequenceReader
 from tests.generators import make_sequence
@@ -247,8 +247,13 @@ def test_truncated_sequence_is_never_opened(good, tmp_path):
             SequenceReader(path)
 
 
-def test_check_reads_every_chunk(good, tmp_path):
-    check_container(good, SEQUENCE)
+def check_all(path):
+    with ContainerReader(path, SEQUENCE) as reader:
+        reader.read_everything()
+
+
+def test_reading_everything_reads_every_chunk(good, tmp_path):
+    check_all(good)
     with h5py.File(good) as file:
         chunk = file["scans/labels"].id.get_chunk_info(1)
     data = bytearray(good.read_bytes())
@@ -256,4 +261,4 @@ def test_check_reads_every_chunk(good, tmp_path):
     path = tmp_path / "flipped.h5"
     path.write_bytes(data)
     with pytest.raises(CorruptFileError, match="truncated or damaged"):
-        check_container(path, SEQUENCE)
+        check_all(path)

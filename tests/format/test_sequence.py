@@ -202,3 +202,12 @@ def test_any_text_becomes_a_valid_name(text):
 def test_unknown_stamps_source_is_refused():
     with pytest.raises(InvalidInputError, match="stamps_source"):
         SequenceHeader(environment="a", recording="b", lidar=SMALL_LIDAR, stamps_source="guess")
+
+
+def test_stamps_whose_difference_is_beyond_int64_are_in_order(tmp_path):
+    wide = make_arrays(3) | {"scans/stamps_ns": np.array([-(2**63), 0, 2**63 - 1])}
+    header = SequenceHeader(environment="a", recording="b", lidar=SMALL_LIDAR)
+    with SequenceWriter(tmp_path / "a.h5", header) as writer:
+        writer.append(wide)
+    with SequenceReader(tmp_path / "a.h5") as reader:
+        reader.check_values()
