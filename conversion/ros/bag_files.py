@@ -124,8 +124,9 @@ def kind_of(path: Path) -> str:
             raise RecordingError(path, f"expected a bag, found {advice}")
     raise RecordingError(
         path,
-        f"not a ROS bag: expected a ROS 1 .bag, or a ROS 2 .db3, .mcap or folder, found a file "
-        f"that starts with {head[:16]!r}",
+        "not a ROS bag, nor any other recording: expected a ROS 1 .bag, a ROS 2 .db3, .mcap or "
+        "folder, a CARMEN log, a published layout (folder, zip, tar), or a .yaml that describes "
+        f"arrays; found a file that starts with {head[:16]!r}",
     )
 
 
