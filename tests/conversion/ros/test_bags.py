@@ -379,7 +379,10 @@ def test_a_bag_without_permission_is_a_permission_error(tmp_path):
 
 REFUSED = {
     "empty.bag": (b"", "the file is empty"),
-    "text.bag": (b"hello, this is no bag at all", "not a ROS bag, nor any other recording: expected a ROS 1 .bag"),
+    "text.bag": (
+        b"hello, this is no bag at all",
+        "not a ROS bag, nor any other recording: expected a ROS 1 .bag",
+    ),
     "short.bag": (b"#ROS", "not a ROS bag"),
     "old.bag": (b"#ROSRECORD V1.2\n0000", r"found '#ROSRECORD V1.2': convert it with ROS 1"),
     "older.bag": (b"#ROSBAG V1.1\n0000", r"version 2.0, found '#ROSBAG V1.1'"),
