@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -90,13 +89,8 @@ class ExportedSource:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.recording.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self.recording.__exit__(*error)
 
     def files(self) -> Sequence[Path]:
         """Return the files of the export."""

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -51,13 +50,8 @@ class MessageSource:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.recording.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self.recording.__exit__(*error)
 
     def files(self) -> Sequence[Path]:
         """Return the files of the recording."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -64,13 +63,8 @@ class RosRecording:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.bag.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self.bag.__exit__(*error)
 
     def files(self) -> Sequence[Path]:
         """Return the files of the bag."""

@@ -346,7 +346,7 @@ def test_flipped_bytes_are_refused_or_change_nothing(tmp_path):
     export_mcap(tmp_path / "a.h5", tmp_path / "a.mcap")
     whole, expected = (tmp_path / "a.mcap").read_bytes(), bits(arrays)
     refused = 0
-    for number, at in enumerate(random.integers(0, len(whole), 40)):
+    for number, at in enumerate(random.integers(0, len(whole), 80)):
         flipped = tmp_path / f"{number}.mcap"
         value = whole[at] ^ int(random.integers(1, 256))
         flipped.write_bytes(whole[:at] + bytes([value]) + whole[at + 1 :])
@@ -354,7 +354,7 @@ def test_flipped_bytes_are_refused_or_change_nothing(tmp_path):
             assert bits(blocks_of(flipped)) == expected
         except RecordingError:
             refused += 1
-    assert refused > 5
+    assert refused > 20  # the rest lie where nothing is said: in names, indexes, padding
 
 
 def test_truncated_exports_are_refused(exported, tmp_path):
