@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +12,8 @@ from tqdm import tqdm
 from conversion.convert import Result, convert_recording
 from conversion.options import Options
 from conversion.provenance import Done, find_done
-from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
-
-_CONNECT_S = 10
-_RETRIES = 3  # of a recording whose worker died: Dask runs it on another
+from semantic2d_dataset.errors import InvalidInputError, Semantic2DError, WorkerLostError
+from semantic2d_dataset.executors import Executor, Serial, open_executor
 
 
 @dataclass(frozen=True)
@@ -90,14 +84,21 @@ def convert_recordings(
         Job(tuple(p.resolve() if scheduler else p for p in paths), out, options, force, done)
         for paths in recordings
     ]
-    if scheduler is not None:
-        yield from _with_bar(_on_cluster(todo, scheduler), len(todo))
-    elif len(todo) == 1:
+    if scheduler is None and len(todo) == 1:
         yield _convert(todo[0])
-    elif jobs > 1:
-        yield from _with_bar(_in_processes(todo, jobs), len(todo))
-    else:
-        yield from map(run, todo)
+        return
+    with open_executor(jobs=jobs, scheduler=scheduler) as executor:
+        yield from run_all(todo, executor)
+
+
+def run_all(todo: Sequence[Job], executor: Executor) -> Iterator[Outcome]:
+    """Convert recordings, and yield what became of each as it is done."""
+    outcomes = executor.map(run, todo, in_order=False, lost=_lost)
+    if not isinstance(executor, Serial):  # where each recording shows a bar of its own
+        outcomes = iter(
+            tqdm(outcomes, total=len(todo), desc="convert", unit="recording", disable=None)
+        )
+    yield from outcomes
 
 
 def run(job: Job) -> Outcome:
@@ -116,57 +117,6 @@ def _convert(job: Job) -> Outcome:
     return Outcome(str(job.recording[0]), results)
 
 
-def _in_processes(todo: Sequence[Job], jobs: int) -> Iterator[Outcome]:
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        waiting = {pool.submit(run, job): job for job in todo}
-        try:
-            for future in as_completed(waiting):
-                yield _outcome(future, waiting[future])
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _outcome(future: Future[Outcome], job: Job) -> Outcome:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        why = "a process was killed (is memory short?); run again to convert what is missing"
-        return Outcome(str(job.recording[0]), error=f"{job.recording[0]}: {why}")
-
-
-def _on_cluster(todo: Sequence[Job], address: str) -> Iterator[Outcome]:
-    from distributed import as_completed as done_first
-
-    with _client(address) as client:
-        waiting = client.map(run, todo, pure=False, retries=_RETRIES)
-        jobs = dict(zip((future.key for future in waiting), todo, strict=True))
-        for future, outcome in done_first(waiting, with_results=True, raise_errors=False):
-            if future.status == "finished":
-                yield outcome
-            else:
-                name = str(jobs[future.key].recording[0])
-                yield Outcome(name, error=f"{name}: given up by the cluster: {outcome[1]!r}")
-
-
-@contextmanager
-def _client(address: str) -> Iterator[Any]:
-    try:
-        from distributed import Client
-    except ImportError as err:
-        raise InvalidInputError(
-            "--scheduler needs Dask: pip install 'semantic2d-dataset[dask]'"
-        ) from err
-    try:
-        client = Client(address, timeout=_CONNECT_S)
-    except (OSError, ValueError) as err:
-        raise InvalidInputError(
-            f"{address}: no Dask scheduler answers there: {err}; start one with: dask scheduler"
-        ) from err
-    try:
-        yield client
-    finally:
-        client.close()
-
-
-def _with_bar(outcomes: Iterator[Outcome], total: int) -> Iterator[Outcome]:
-    yield from tqdm(outcomes, total=total, desc="convert", unit="recording", disable=None)
+def _lost(job: Job, error: WorkerLostError) -> Outcome:
+    name = str(job.recording[0])
+    return Outcome(name, error=f"{name}: {error}")

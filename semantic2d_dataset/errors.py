@@ -15,6 +15,7 @@
         ├── RecordingError                             a recording that cannot be converted
         ├── AlignmentError                             scans that do not fit their map
         ├── SubmissionError (ValueError)               predictions that cannot be scored
+        ├── WorkerLostError                            a process or worker died with its task
         └── WriteError (OSError)                       a file could not be written
 
 ``FileNotFoundError`` and ``PermissionError`` of single files pass through as they are.
@@ -106,6 +107,10 @@ class SubmissionError(Semantic2DError, ValueError):
 
     def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
         return type(self), (self.path, self.problems)
+
+
+class WorkerLostError(Semantic2DError):
+    """A process of this machine, or a worker of a cluster, died with what it was working on."""
 
 
 class WriteError(Semantic2DError, OSError):

@@ -16,6 +16,7 @@ ROOMS = (
     "errors",
     "scene",
     "format",
+    "executors",
     "simulation",
     "scoring",
     "access",

@@ -1,14 +1,10 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +14,10 @@ from conversion import jobs
 from conversion.convert import Kept
 from conversion.jobs import convert_recordings
 from conversion.summary import Summary
+from semantic2d_dataset import executors
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.sequence import SequenceReader
+from tests.clusters import cluster
 from tests.conversion.recordings import START_NS, Recording, straight_drive
 
 
@@ -79,7 +77,7 @@ def die(job):
 
 def test_a_scheduler_that_does_not_answer_is_told(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(jobs, "_CONNECT_S", 1)
+    monkeypatch.setattr(executors, "_CONNECT_S", 1)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
@@ -96,42 +94,6 @@ def long_drive(folder: Path, name: str) -> Path:
         ranges = random.uniform(0.2, 20, 400).astype(np.float32)
         drive.add_scan(START_NS + n * 10_000_000, ranges, intensities=ranges, increment=0.01)
     return drive.write(folder, name)
-
-
-@contextmanager
-def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and two workers, as their command lines start them."""
-    dask = Path(sys.executable).with_name("dask")
-    log = folder / "scheduler.log"
-    started = []
-    try:
-        with log.open("wb") as stream:
-            words = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-            started.append(subprocess.Popen([dask, *words], stderr=stream, cwd=folder))
-        address = wait_for_address(log)
-        for n in range(2):
-            (folder / f"worker{n}").mkdir()
-            words = ["worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
-            started.append(
-                subprocess.Popen(
-                    [dask, *words], cwd=folder / f"worker{n}", stderr=subprocess.DEVNULL
-                )
-            )
-        yield address, started[1:]
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
-
-
-def wait_for_address(log: Path) -> str:
-    until = time.monotonic() + 60
-    while time.monotonic() < until:
-        found = re.search(r"tcp://127\.0\.0\.1:\d+", log.read_text())
-        if found:
-            return found[0]
-        time.sleep(0.1)
-    raise TimeoutError(log.read_text())
 
 
 @pytest.mark.long
