@@ -34,6 +34,7 @@ Float = NDArray[np.float64]
 MAP_RESOLUTION = 0.05  # m, as mapping packages choose it by default
 _MARGIN = 1.0  # m of unknown space around a map
 _GRID = 1e-4  # m, as in `furniture`
+_LONG_WALL = 0.3  # m
 # what a surface of each class is made of where only its class is known
 _USUAL_MATERIAL = {
     OTHER: material.CARDBOARD,
@@ -114,20 +115,20 @@ def world_from_map(name: str, scene_map: SemanticMap, tour: Float) -> World:
     """Build a world whose solid things are the occupied cells of a map.
 
     Each edge between an occupied and another cell becomes a segment of the cell's class; cells
-    without one are walls.
+    without one are walls. Cells of one class that touch each other are one object.
 
     Parameters
     ----------
     tour
         (K, 2) f8, m, map frame: places in free space that a robot visits.
     """
-    segments, labels = _cell_edges(scene_map)
-    labels = np.where(labels == UNLABELLED, WALL, labels).astype(np.uint8)
+    segments, cells = _cell_edges(scene_map)
+    labels = np.where(scene_map.labels == UNLABELLED, WALL, scene_map.labels)
+    objects = _number_objects(labels, scene_map.occupancy == OCCUPIED)[tuple(cells.T)]
+    labels = labels[tuple(cells.T)].astype(np.uint8)
     usual = np.array([_USUAL_MATERIAL[k] for k in range(len(_USUAL_MATERIAL))], np.uint8)
     surfaces = material.Surfaces(labels, usual[labels], np.ones(len(labels)))
-    primitives = Primitives(
-        segments, np.zeros((0, 3)), surfaces, np.arange(len(labels), dtype=np.int32)
-    )
+    primitives = Primitives(segments, np.zeros((0, 3)), surfaces, objects)
     return World(name, primitives, scene_map, np.asarray(tour, np.float64))
 
 
@@ -149,7 +150,8 @@ def perturb(
         Unmapped objects for each square metre of free space; about 20 cm wide, near
         mapped ones.
     warp_m
-        Each wall is displaced as a whole by between 0.75 and 1.25 of this, either way.
+        Each wall is displaced as a whole by between 0.75 and 1.25 of this, either way; walls that
+        consist of short pieces, as those of `world_from_map`, are bent by as much.
 
     Returns
     -------
@@ -242,20 +244,29 @@ def rasterise(primitives: Primitives, seen_from: Float) -> SemanticMap:
     return SemanticMap(occupancy, labels.astype(np.uint8), MAP_RESOLUTION, origin)
 
 
-def _cell_edges(scene: SemanticMap) -> tuple[Float, NDArray[np.uint8]]:
-    """Edges of occupied cells that face other cells, (M, 4), and the cells' labels (M,)."""
+def _number_objects(labels: NDArray[np.uint8], solid: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Give connected cells (H, W) of one class a number of their own; 0 where nothing is."""
+    objects = np.zeros(labels.shape, np.int32)
+    for label in np.unique(labels[solid]):
+        parts, _ = ndimage.label(solid & (labels == label), np.ones((3, 3)))
+        objects = np.where(parts > 0, parts + objects.max(), objects).astype(np.int32)
+    return objects
+
+
+def _cell_edges(scene: SemanticMap) -> tuple[Float, NDArray[np.int64]]:
+    """Edges of occupied cells that face other cells, (M, 4), and their cells (M, 2)."""
     solid = np.pad(scene.occupancy == OCCUPIED, 1)
-    found, labels = [], []
+    found, cells = [], []
     for row, column, edge in (
         (-1, 0, (0, 0, 1, 0)), (1, 0, (1, 1, 0, 1)), (0, -1, (0, 1, 0, 0)), (0, 1, (1, 0, 1, 1)),
     ):  # fmt: skip
         facing = solid & ~np.roll(solid, (-row, -column), (0, 1))
         rows, columns = np.nonzero(facing[1:-1, 1:-1])
         found.append(np.stack((columns, rows, columns, rows), axis=-1) + np.array(edge))
-        labels.append(scene.labels[rows, columns])
+        cells.append(np.stack((rows, columns), axis=-1))
     corners = np.concatenate(found).reshape(-1, 2, 2) * scene.resolution
     origin = np.array((scene.origin.x, scene.origin.y, scene.origin.yaw))
-    return transform(origin, corners).reshape(-1, 4), np.concatenate(labels)
+    return transform(origin, corners).reshape(-1, 4), np.concatenate(cells)
 
 
 def _move_furniture(
@@ -295,16 +306,30 @@ def _clutter_spots(
 
 
 def _warp_walls(primitives: Primitives, rng: np.random.Generator, warp_m: float) -> Primitives:
-    """Displace every long wall across its direction."""
+    """Displace every long wall across its direction, and bend those made of short pieces."""
     segments = primitives.segments.copy()
     along = segments[:, 2:] - segments[:, :2]
     lengths = np.hypot(*along.T)
-    walls = (primitives.labels[: len(segments)] == WALL) & (lengths > 0.3)
+    is_wall = primitives.labels[: len(segments)] == WALL
+    walls = is_wall & (lengths > _LONG_WALL)
     across = np.stack((-along[:, 1], along[:, 0]), axis=-1) / np.maximum(lengths, _GRID)[:, None]
     size = warp_m * (0.75 + 0.5 * rng.random(len(segments)))
     size *= np.where(rng.random(len(segments)) < 0.5, -1.0, 1.0) * walls
     segments += np.tile(across * size[:, None], 2)
+    short = is_wall & (lengths <= _LONG_WALL)
+    ends = segments[short].reshape(-1, 2)
+    segments[short] = (ends + _bend(ends, rng, warp_m)).reshape(-1, 4)
     return replace(primitives, segments=_snap(segments))
+
+
+def _bend(points: Float, rng: np.random.Generator, warp_m: float) -> Float:
+    """Return displacements (P, 2) whose direction and size change over metres."""
+    waves = 2 * math.pi * rng.random((2, 3))
+    x, y = points.T
+    way = waves[0, 0] + 2 * np.sin(x / 2 + waves[0, 1]) + 2 * np.sin(y / 2 + waves[0, 2])
+    size = warp_m * (1 + 0.25 * np.sin(x + waves[1, 0]) * np.sin(y + waves[1, 1]))
+    bent: Float = size[:, None] * np.stack((np.cos(way), np.sin(way)), axis=-1)
+    return bent
 
 
 def _snap(values: Float) -> Float:
