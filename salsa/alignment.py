@@ -102,7 +102,7 @@ def align(
     *,
     points: Literal["all", "lines"] = "all",
     acceptance: Acceptance = TRUSTED,
-    before: tuple[Float, Float] | None = None,
+    before: Float | None = None,
 ) -> Alignment:
     """Refine the pose of every scan so that its points lie on the map.
 
@@ -117,8 +117,8 @@ def align(
     acceptance
         When an alignment is trusted.
     before
-        Refined and rough pose, each (3,), of an accepted scan just before the batch: so that
-        blocks of a long recording follow each other as its scans do.
+        Refined and rough pose (2, 3) of an accepted scan just before the batch: so that blocks of
+        a long recording follow each other as its scans do.
 
     Returns
     -------
@@ -149,13 +149,16 @@ def measure(
     """Say how well scans fit a map at given poses (N, 3), which stay as they are."""
     field = as_field(scene)
     grid = field.origin.as_array()
-    residual_m, inlier_ratio = fit(batch, poses, field, acceptance.inlier_m)
+    residual_m, inlier_ratio = np.full(len(batch), np.inf, np.float32), np.zeros(len(batch), "f4")
     covariance = np.full((len(batch), 3, 3), np.nan)
-    registration.covariance_each(
+    registration.measure_each(
         *beams_of(batch, batch.valid),
         compose(invert(grid), poses),
-        field.distance_m,
+        field.surface,
         field.resolution,
+        acceptance.inlier_m,
+        residual_m,
+        inlier_ratio,
         covariance,
     )
     accepted = (
@@ -176,7 +179,7 @@ def fit(
     registration.fit_each(
         *beams_of(batch, batch.valid),
         compose(invert(field.origin.as_array()), poses),
-        field.distance_m,
+        field.surface,
         field.resolution,
         inlier_m,
         residual_m,
@@ -221,7 +224,7 @@ def _size(field: MapField) -> Float:
 
 def _register(beams: Beams, starts: Float, before: Float, field: MapField) -> Float:
     """Align each scan by itself, then let neighbours help, forward and backward in time."""
-    grid = field.distance_m, field.resolution
+    grid = field.surface, field.resolution
     poses, costs = starts.copy(), np.full(len(starts), np.inf)
     registration.register_each(*beams, starts, *grid, poses, costs)
     order = np.arange(len(starts))
@@ -231,11 +234,11 @@ def _register(beams: Beams, starts: Float, before: Float, field: MapField) -> Fl
     return poses
 
 
-def _in_grid(before: tuple[Float, Float] | None, grid: Float) -> Float:
+def _in_grid(before: Float | None, grid: Float) -> Float:
     """Return pose and start (2, 3) in the frame of the grid, NaN where there is none."""
     if before is None:
         return np.full((2, 3), np.nan)
-    return compose(invert(grid), np.stack(before))
+    return compose(invert(grid), before)
 
 
 def _near_lines(batch: ScanBatch) -> NDArray[np.bool_]:

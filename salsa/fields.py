@@ -22,6 +22,10 @@ class MapField:
     ----------
     distance_m
         (H, W) f4: from the centre of each cell to that of the nearest occupied one.
+    surface
+        (H, W, 4) f4: the same, interpolated bilinearly between the centres of cell (row, column)
+        and its neighbours above and to the right: value at the cell's centre, change to the
+        right, change upward, and the change of these; see `salsa.registration`.
     nearest_label
         (H, W) u1: class of that occupied cell, 255 where it has none.
     border_m
@@ -35,6 +39,7 @@ class MapField:
     """
 
     distance_m: NDArray[np.float32]
+    surface: NDArray[np.float32]
     nearest_label: NDArray[np.uint8]
     border_m: NDArray[np.float32]
     free: NDArray[np.bool_]
@@ -62,8 +67,10 @@ def map_field(scene: SemanticMap, taxonomy: Taxonomy = SEMANTIC2D) -> MapField:
         )
     distance, indices = ndimage.distance_transform_edt(~occupied, return_indices=True)
     label = scene.labels[tuple(indices)]
+    distance_m = (distance * scene.resolution).astype(np.float32)
     return MapField(
-        distance_m=(distance * scene.resolution).astype(np.float32),
+        distance_m=distance_m,
+        surface=_surface(distance_m),
         nearest_label=label,
         border_m=_border_distance(label) * np.float32(scene.resolution),
         free=(scene.occupancy == FREE) | people,
@@ -80,6 +87,14 @@ def as_field(scene: SemanticMap | MapField) -> MapField:
 def has_labels(field: MapField) -> bool:
     """Tell whether any object of the map carries a class."""
     return bool((field.nearest_label != UNLABELLED).any())
+
+
+def _surface(distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the bilinear surface through the values at the centres of the cells."""
+    padded = np.pad(distance_m, ((0, 1), (0, 1)), mode="edge")
+    right, up = np.diff(padded[:-1], axis=1), np.diff(padded[:, :-1], axis=0)
+    both = np.diff(np.diff(padded, axis=1), axis=0)
+    return np.stack((distance_m, right, up, both), axis=-1)
 
 
 def _border_distance(label: NDArray[np.uint8]) -> NDArray[np.float32]:

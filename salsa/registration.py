@@ -1,7 +1,9 @@
 """The numerical heart of the alignment: robust scan-to-map registration on a distance field.
 
-Poses are x, y, yaw in the frame of the grid (m, rad; the corner of cell (0, 0) is its origin), the
-distance field is (H, W) f4 in m at cell centres, points are (P, 2) f8 in m in the base frame.
+Poses are x, y, yaw in the frame of the grid (m, rad; the corner of cell (0, 0) is its origin),
+points are (P, 2) f8 in m in the base frame. The distance field comes as a surface (H, W, 4) f4:
+between the centres of four cells the distance in m is ``d + du fu + (dv + duv fu) fv``, with what
+is looked up together lying together.
 """
 
 from __future__ import annotations
@@ -16,12 +18,14 @@ from semantic2d_dataset.scene.geometry import beam_directions, mount_in_plane
 from semantic2d_dataset.scene.scans import ScanBatch
 
 Float = NDArray[np.float64]
-Field = NDArray[np.float32]
+Surface = NDArray[np.float32]
+_FAST = {"reassoc", "contract", "nsz", "arcp"}  # sums need not keep their order
 
 FIRST_SCALE_M, LAST_SCALE_M = 0.5, 0.1  # finer than 0.1 m is worse where the world has changed
 SHRINK = 0.75  # of the scale, per iteration
-STRIDE = 4  # of the points, until these have settled at the last scale
-FINE_STEPS = 4  # at most, with all points
+COARSE_POINTS = 128  # evenly spaced, until these have settled at the last scale
+FINE_POINTS = 512  # then: more cost time and change nothing
+FINE_STEPS = 2  # at most, with these
 MAX_STEPS = 30
 STEP_M, STEP_RAD = 5e-4, 1e-4  # smaller steps end the iteration
 
@@ -60,30 +64,38 @@ def base_points(
     return points[:count]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=_FAST)
+def distance_at(u: float, v: float, surface: Surface) -> float:
+    """Return the distance in m at column u, row v (0, 0 is the centre of a cell); -1 beyond it."""
+    rows, columns = surface.shape[:2]
+    if not (u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1):
+        return -1.0
+    column, row = int(u), int(v)
+    fu, fv = u - column, v - row
+    d, du, dv, duv = surface[row, column]
+    distance: float = d + du * fu + (dv + duv * fu) * fv
+    return distance
+
+
+@numba.njit(cache=True, fastmath=_FAST)
 def robust_cost(
-    points: Float, stride: int, pose: Float, field: Field, resolution: float, scale: float
+    points: Float, stride: int, pose: Float, surface: Surface, resolution: float, scale: float
 ) -> float:
     """Return the mean Geman-McClure cost 0..1 of the points; outside the map a point costs 1."""
     c, s = math.cos(pose[2]) / resolution, math.sin(pose[2]) / resolution
-    x0, y0 = pose[0] / resolution, pose[1] / resolution
-    rows, columns = field.shape
+    u0, v0 = pose[0] / resolution - 0.5, pose[1] / resolution - 0.5
     total, count = 0.0, 0
     for k in range(0, len(points), stride):
-        column = math.floor(x0 + c * points[k, 0] - s * points[k, 1])
-        row = math.floor(y0 + s * points[k, 0] + c * points[k, 1])
+        x, y = points[k, 0], points[k, 1]
+        d = distance_at(u0 + c * x - s * y, v0 + s * x + c * y, surface)
+        total += d * d / (d * d + scale * scale) if d >= 0.0 else 1.0
         count += 1
-        if 0 <= row < rows and 0 <= column < columns:
-            d2 = np.float64(field[row, column]) ** 2
-            total += d2 / (d2 + scale * scale)
-        else:
-            total += 1.0
     return total / max(count, 1)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=_FAST)
 def normal_equations(
-    points: Float, stride: int, pose: Float, field: Field, resolution: float, scale: float
+    points: Float, stride: int, pose: Float, surface: Surface, resolution: float, scale: float
 ) -> tuple[Float, Float, float, float]:
     """Linearise the weighted distances at a pose.
 
@@ -94,48 +106,43 @@ def normal_equations(
         take no part.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    rows, columns = field.shape
-    hessian, gradient = np.zeros((3, 3)), np.zeros(3)
-    squares, weights = 0.0, 0.0
+    per_m = 1.0 / resolution
+    u0, v0 = pose[0] * per_m - 0.5, pose[1] * per_m - 0.5
+    rows, columns = surface.shape[:2]
+    g0, g1, g2, squares, weights = 0.0, 0.0, 0.0, 0.0, 0.0
     h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(0, len(points), stride):
         dx = cos * points[k, 0] - sin * points[k, 1]
         dy = sin * points[k, 0] + cos * points[k, 1]
-        u = (pose[0] + dx) / resolution - 0.5
-        v = (pose[1] + dy) / resolution - 0.5
-        column, row = math.floor(u), math.floor(v)
-        if not (0 <= row < rows - 1 and 0 <= column < columns - 1):
-            continue
-        fu, fv = u - column, v - row
-        d00, d01 = field[row, column], field[row, column + 1]
-        d10, d11 = field[row + 1, column], field[row + 1, column + 1]
-        d = (1 - fv) * ((1 - fu) * d00 + fu * d01) + fv * ((1 - fu) * d10 + fu * d11)
-        gx = ((1 - fv) * (d01 - d00) + fv * (d11 - d10)) / resolution
-        gy = ((1 - fu) * (d10 - d00) + fu * (d11 - d01)) / resolution
-        gt = gy * dx - gx * dy
-        w = (scale * scale / (scale * scale + d * d)) ** 2
-        h00, h01, h02 = h00 + w * gx * gx, h01 + w * gx * gy, h02 + w * gx * gt
-        h11, h12, h22 = h11 + w * gy * gy, h12 + w * gy * gt, h22 + w * gt * gt
-        gradient[0] += w * d * gx
-        gradient[1] += w * d * gy
-        gradient[2] += w * d * gt
-        squares += w * d * d
-        weights += w
-    hessian[0, 0], hessian[1, 1], hessian[2, 2] = h00, h11, h22
-    hessian[0, 1], hessian[0, 2], hessian[1, 2] = h01, h02, h12
-    hessian[1, 0], hessian[2, 0], hessian[2, 1] = h01, h02, h12
-    return hessian, gradient, squares, weights
+        u, v = u0 + dx * per_m, v0 + dy * per_m
+        if u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1:
+            column, row = int(u), int(v)
+            fu, fv = u - column, v - row
+            d, du, dv, duv = surface[row, column]
+            gx, gy = du + duv * fv, dv + duv * fu
+            d += du * fu + gy * fv
+            gt = gy * dx - gx * dy
+            share = scale * scale / (scale * scale + d * d)
+            w = share * share
+            wx, wy, wt = w * gx, w * gy, w * gt
+            h00, h01, h02 = h00 + wx * gx, h01 + wx * gy, h02 + wx * gt
+            h11, h12, h22 = h11 + wy * gy, h12 + wy * gt, h22 + wt * gt
+            g0, g1, g2 = g0 + wx * d, g1 + wy * d, g2 + wt * d
+            squares += w * d * d
+            weights += w
+    hessian = np.array(((h00, h01, h02), (h01, h11, h12), (h02, h12, h22))) * (per_m * per_m)
+    return hessian, np.array((g0, g1, g2)) * per_m, squares, weights
 
 
 @numba.njit(cache=True)
 def refine(
-    points: Float, start: Float, field: Field, resolution: float, first_scale: float
+    points: Float, start: Float, surface: Surface, resolution: float, first_scale: float
 ) -> Float:
     """Move a pose so that the points lie on the map: Gauss-Newton with a shrinking robust scale."""
     pose, scale, fine = start.copy(), first_scale, 0
     for _ in range(MAX_STEPS):
-        stride = STRIDE if fine == 0 else 1
-        h, g, _squares, weights = normal_equations(points, stride, pose, field, resolution, scale)
+        stride = max(len(points) // (COARSE_POINTS if fine == 0 else FINE_POINTS), 1)
+        h, g, _squares, weights = normal_equations(points, stride, pose, surface, resolution, scale)
         step = solve(h, g, 1e-3 * weights + 1e-9)
         pose -= step
         if scale <= LAST_SCALE_M:
@@ -166,7 +173,7 @@ def solve(h: Float, g: Float, damping: float) -> Float:
 
 
 @numba.njit(cache=True)
-def search(points: Float, centre: Float, field: Field, resolution: float) -> Float:
+def search(points: Float, centre: Float, surface: Surface, resolution: float) -> Float:
     """Score a lattice of poses around a centre, refine the best few and return the best of them."""
     stride = max(len(points) // SEARCH_POINTS, 1)
     best_costs = np.full(CANDIDATES, np.inf)
@@ -178,15 +185,15 @@ def search(points: Float, centre: Float, field: Field, resolution: float) -> Flo
                 pose[0] = centre[0] + i * SEARCH_M
                 pose[1] = centre[1] + j * SEARCH_M
                 pose[2] = centre[2] + k * SEARCH_RAD
-                cost = robust_cost(points, stride, pose, field, resolution, SEARCH_SCALE_M)
+                cost = robust_cost(points, stride, pose, surface, resolution, SEARCH_SCALE_M)
                 worst = np.argmax(best_costs)
                 if cost < best_costs[worst]:
                     best_costs[worst] = cost
                     best_poses[worst] = pose
     best, lowest = centre.copy(), np.inf
     for m in range(CANDIDATES):
-        pose = refine(points, best_poses[m], field, resolution, FIRST_SCALE_M / 2)
-        cost = robust_cost(points, 1, pose, field, resolution, LAST_SCALE_M)
+        pose = refine(points, best_poses[m], surface, resolution, FIRST_SCALE_M / 2)
+        cost = robust_cost(points, 1, pose, surface, resolution, LAST_SCALE_M)
         if cost < lowest:
             best, lowest = pose, cost
     return best
@@ -199,7 +206,7 @@ def register_each(
     directions: Float,
     offset: Float,
     starts: Float,
-    field: Field,
+    surface: Surface,
     resolution: float,
     poses: Float,
     costs: Float,
@@ -207,27 +214,31 @@ def register_each(
     """Refine every scan from its own start (N, 3); search where the cost stays high."""
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
-        costs[n] = register_one(points, starts[n], field, resolution, poses[n])
+        costs[n] = register_one(points, starts[n], surface, resolution, poses[n])
 
 
 @numba.njit(cache=True)
-def register_one(points: Float, start: Float, field: Field, resolution: float, out: Float) -> float:
+def register_one(
+    points: Float, start: Float, surface: Surface, resolution: float, out: Float
+) -> float:
     """Write the refined pose into `out` and return its cost, infinity where nothing was done."""
     if len(points) == 0 or not np.isfinite(start).all():
         return np.inf
-    pose, cost = register(points, start, field, resolution)
+    pose, cost = register(points, start, surface, resolution)
     out[:] = pose
     return cost
 
 
 @numba.njit(cache=True)
-def register(points: Float, start: Float, field: Field, resolution: float) -> tuple[Float, float]:
+def register(
+    points: Float, start: Float, surface: Surface, resolution: float
+) -> tuple[Float, float]:
     """Refine a start, and search around it where the cost stays high."""
-    pose = refine(points, start, field, resolution, FIRST_SCALE_M)
-    cost = robust_cost(points, 1, pose, field, resolution, LAST_SCALE_M)
+    pose = refine(points, start, surface, resolution, FIRST_SCALE_M)
+    cost = robust_cost(points, 1, pose, surface, resolution, LAST_SCALE_M)
     if cost > HIGH_COST:
-        other = search(points, start, field, resolution)
-        other_cost = robust_cost(points, 1, other, field, resolution, LAST_SCALE_M)
+        other = search(points, start, surface, resolution)
+        other_cost = robust_cost(points, 1, other, surface, resolution, LAST_SCALE_M)
         if other_cost < cost:
             return other, other_cost
     return pose, cost
@@ -242,17 +253,17 @@ def chain(
     starts: Float,
     order: NDArray[np.int64],
     before: Float,
-    field: Field,
+    surface: Surface,
     resolution: float,
     poses: Float,
     costs: Float,
 ) -> None:
-    """Where a neighbour fits better, try its pose, moved as the starts moved, as another start.
+    """Where a neighbour fits better, try its pose as another start: moved as the starts moved, too.
 
     Starts that drift away still move rightly from scan to scan, so that one good pose pulls those
-    after it in. `order` (N,) says which scan follows which, `before` (2, 3) are pose and start of
-    a trusted scan before the first (NaN where there is none); a cost of infinity marks a scan
-    that is not aligned.
+    after it in; where they jump about, the robot has hardly moved. `order` (N,) says which scan
+    follows which, `before` (2, 3) are pose and start of a trusted scan before the first (NaN where
+    there is none); a cost of infinity marks a scan that is not aligned.
     """
     pose, start = before[0], before[1]
     cost = -np.inf if np.isfinite(before).all() else np.inf
@@ -261,9 +272,10 @@ def chain(
             continue
         if costs[n] > cost + WORSE_COST:
             points = base_points(ranges[n], use[n], directions, offset)
-            other, other_cost = register(points, carry(pose, start, starts[n]), field, resolution)
-            if other_cost < costs[n]:
-                poses[n], costs[n] = other, other_cost
+            for guess in (carry(pose, start, starts[n]), pose.copy()):
+                other, other_cost = register(points, guess, surface, resolution)
+                if other_cost < costs[n]:
+                    poses[n], costs[n] = other, other_cost
         pose, start, cost = poses[n], starts[n], costs[n]
 
 
@@ -287,7 +299,7 @@ def fit_each(
     directions: Float,
     offset: Float,
     poses: Float,
-    field: Field,
+    surface: Surface,
     resolution: float,
     inlier_m: float,
     residual_m: NDArray[np.float32],
@@ -297,44 +309,36 @@ def fit_each(
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
         if len(points) > 0 and np.isfinite(poses[n, 0]):
-            quality = fit_quality(points, poses[n], field, resolution, inlier_m)
+            quality = fit_quality(points, poses[n], surface, resolution, inlier_m)
             residual_m[n], inlier_ratio[n] = quality
 
 
 @numba.njit(cache=True, parallel=True)
-def covariance_each(
+def measure_each(
     ranges: NDArray[np.float32],
     use: NDArray[np.bool_],
     directions: Float,
     offset: Float,
     poses: Float,
-    field: Field,
+    surface: Surface,
     resolution: float,
+    inlier_m: float,
+    residual_m: NDArray[np.float32],
+    inlier_ratio: NDArray[np.float32],
     covariance: Float,
 ) -> None:
-    """Write the covariance (3, 3) of every pose that is known."""
+    """Say how every scan fits, and write the covariance (3, 3) of every pose that is known."""
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
         if len(points) > 0 and np.isfinite(poses[n, 0]):
-            pose_covariance(points, poses[n], field, resolution, covariance[n])
-
-
-@numba.njit(cache=True)
-def distance_at(u: float, v: float, field: Field) -> float:
-    """Interpolate the field bilinearly at column u, row v (cell centres); infinity beyond it."""
-    column, row = math.floor(u), math.floor(v)
-    if not (0 <= row < field.shape[0] - 1 and 0 <= column < field.shape[1] - 1):
-        return math.inf
-    fu, fv = u - column, v - row
-    below = (1 - fu) * field[row, column] + fu * field[row, column + 1]
-    above = (1 - fu) * field[row + 1, column] + fu * field[row + 1, column + 1]
-    distance: float = (1 - fv) * below + fv * above
-    return distance
+            quality = fit_quality(points, poses[n], surface, resolution, inlier_m)
+            residual_m[n], inlier_ratio[n] = quality
+            pose_covariance(points, poses[n], surface, resolution, covariance[n])
 
 
 @numba.njit(cache=True)
 def fit_quality(
-    points: Float, pose: Float, field: Field, resolution: float, inlier_m: float
+    points: Float, pose: Float, surface: Surface, resolution: float, inlier_m: float
 ) -> tuple[float, float]:
     """Return the rms distance of the points within `inlier_m` of the map (m), and their share."""
     c, s = math.cos(pose[2]) / resolution, math.sin(pose[2]) / resolution
@@ -342,8 +346,8 @@ def fit_quality(
     squares, count = 0.0, 0
     for k in range(len(points)):
         u = u0 + c * points[k, 0] - s * points[k, 1]
-        distance = distance_at(u, v0 + s * points[k, 0] + c * points[k, 1], field)
-        if distance <= inlier_m:
+        distance = distance_at(u, v0 + s * points[k, 0] + c * points[k, 1], surface)
+        if 0.0 <= distance <= inlier_m:
             squares += distance * distance
             count += 1
     if count == 0:
@@ -353,14 +357,14 @@ def fit_quality(
 
 @numba.njit(cache=True)
 def pose_covariance(
-    points: Float, pose: Float, field: Field, resolution: float, out: Float
+    points: Float, pose: Float, surface: Surface, resolution: float, out: Float
 ) -> None:
     """Write the covariance (3, 3) of a pose, from the normal equations at the last scale.
 
     The variance of a distance is that of the weighted residuals, and never below that of a point
     spread evenly over one cell.
     """
-    h, _g, squares, weights = normal_equations(points, 1, pose, field, resolution, LAST_SCALE_M)
+    h, _g, squares, weights = normal_equations(points, 1, pose, surface, resolution, LAST_SCALE_M)
     variance = max(squares / max(weights, 1e-9), resolution * resolution / 12.0)
     unit = np.zeros(3)
     for k in range(3):

@@ -52,8 +52,8 @@ def test_a_block_goes_on_where_the_last_one_ended():
     batch = rooms.batch_at(truth[1:], rough[1:])
     far = Acceptance(max_correction_m=9.0)
     alone = align(batch, rooms.room_map(), acceptance=far)
-    helped = align(batch, rooms.room_map(), acceptance=far, before=(truth[0], rough[0]))
-    refused = align(batch, rooms.room_map(), before=(truth[0], rough[0]))
+    helped = align(batch, rooms.room_map(), acceptance=far, before=np.stack((truth[0], rough[0])))
+    refused = align(batch, rooms.room_map(), before=np.stack((truth[0], rough[0])))
     assert rooms.errors(alone.poses, truth[1:])[0].min() > 0.2
     assert not alone.accepted.any()
     assert rooms.errors(helped.poses, truth[1:])[0].max() < 0.05
