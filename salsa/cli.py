@@ -39,20 +39,35 @@ def label(
         bool, typer.Option("--json", help="Print JSON for a program to read.")
     ] = False,
     static_after: Annotated[
-        int | None,
+        int,
         typer.Option(
-            min=1,
-            help="Call unmapped things Other, not Person, that stay longer than this many "
-            "seconds; people who stand still as long are lost.",
+            min=0,
+            help="Take what is seen to stay in free space for this many seconds, and has no legs, "
+            "for a thing and not a person; 0 calls all of it Person.",
         ),
+    ] = 5,
+    ignore_no_return: Annotated[
+        bool,
+        typer.Option(
+            "--ignore-no-return", help="Leave beams without a return unlabelled, not Other."
+        ),
+    ] = False,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="Processes; one already uses all cores for most of it.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://host:8786.")
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Picture of all labelled points over the map, to write.")
     ] = None,
 ) -> None:
     """Align a sequence with its map and write a labelled copy."""
-    from salsa.persistence import Persistence
-    from salsa.sequences import Settings, check_target, input_files, label_sequence
+    from salsa.labelling import Transfer
+    from salsa.sequences import check_target, input_files, label_sequence
+    from salsa.settings import Settings
+    from salsa.things import Persistence
+    from semantic2d_dataset.executors import open_executor
 
     if plot is not None:  # before hours of work
         from semantic2d_dataset.plotting import check_picture_name
@@ -60,9 +75,20 @@ def label(
         check_picture_name(plot)
         inputs = input_files(sequence, map_yaml, annotation).values()
         check_target(plot, (*inputs, out), force=force)
-    persistence = None if static_after is None else Persistence(min_seconds=static_after)
-    settings = Settings(persistence=persistence)
-    summary = label_sequence(sequence, map_yaml, annotation, out, settings=settings, force=force)
+    settings = Settings(
+        persistence=Persistence(min_seconds=static_after) if static_after else None,
+        transfer=Transfer(ignore_no_return=ignore_no_return),
+    )
+    with open_executor(jobs=jobs, scheduler=scheduler) as executor:
+        summary = label_sequence(
+            sequence,
+            map_yaml,
+            annotation,
+            out,
+            settings=settings,
+            force=force,
+            executor=executor,
+        )
     typer.echo(json.dumps(asdict(summary), indent=1) if as_json else _describe(summary, out))
     if plot is not None:
         from salsa.pictures import plot_labelled_sequence
@@ -80,8 +106,11 @@ def _describe(summary: Summary, out: Path) -> str:
         f"points within 10 cm of the map (median scan): {near}",
         f"rms distance of these: {100 * summary.median_residual_m:.1f} cm",
     ]
-    if summary.static_cells:
-        lines.append(f"unmapped things that stay: {summary.static_cells} cells, called Other")
+    if summary.things or summary.standing:
+        lines.append(
+            f"unmapped and staying: {summary.things} things, {summary.things_moved} of them mapped "
+            f"objects that were moved; {summary.standing} legs or pairs of legs of people who stand"
+        )
     lines.append("points:")
     lines += [
         f"  {name:<11}{count:>10}  {100 * count / total:5.1f} %"

@@ -1,12 +1,12 @@
 """Label transfer: from aligned scans and an annotated map to a class per point (paper, step 3).
 
 A point on a mapped object takes its class, a point in free space is a person (nothing else moved
-in the recordings), and everything else is Other.
+in the recordings) unless it belongs to a thing that stays there, and everything else is Other.
 """
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -35,13 +35,16 @@ class Transfer:
     sure_m
         Distance beyond which a doubt about a label is over, m: of a person from the nearest
         object, and of a point on an object from the next object of another class.
+    ignore_no_return
+        Leave beams without a return unlabelled (255) instead of calling them Other.
     """
 
     object_m: float = 0.15
     sure_m: float = 0.3
+    ignore_no_return: bool = False
 
     def __post_init__(self) -> None:
-        if not all(0 < value <= 5 for value in astuple(self)):
+        if not all(0 < value <= 5 for value in (self.object_m, self.sure_m)):
             raise InvalidInputError(f"transfer distances must lie in (0, 5] m, found {self}")
 
 
@@ -56,6 +59,7 @@ def transfer_labels(
     accepted: NDArray[np.bool_],
     *,
     quality: NDArray[np.floating] | None = None,
+    things: Labels | None = None,
     transfer: Transfer = DEFAULT_TRANSFER,
     taxonomy: Taxonomy = SEMANTIC2D,
 ) -> tuple[Labels, Labels]:
@@ -73,6 +77,9 @@ def transfer_labels(
         (N,) bool: scans to label; all beams of the others stay 255.
     quality
         (N,) share 0..1 of each scan that fits the map; 1 unless given.
+    things
+        (H, W) u1 class of what stays in free cells of the map, 255 elsewhere
+        (`salsa.things.Things.layer`).
     transfer
         Distances.
     taxonomy
@@ -83,9 +90,10 @@ def transfer_labels(
     labels, confidence
         (N, B) u1 class ids and (N, B) u1. Confidence is 255 times the product of the scan's
         quality, of how near the point is to its object (1 on it, 1/2 at `object_m`; for Person
-        1/2 at `object_m` and 1 from `sure_m` beyond it on), and of how far the next object of
-        another class is (1/2 on the border, 1 from `sure_m` on; mapped classes only). Other is
-        as sure as the scan; beams without a return and scans not accepted have 0.
+        1/2 at `object_m` and 1 from `sure_m` beyond it on; 1/2 for things that stay), and of how
+        far the next object of another class is (1/2 on the border, 1 from `sure_m` on; mapped
+        classes only). Other is as sure as the scan; beams without a return and scans not accepted
+        have 0.
 
     Raises
     ------
@@ -97,6 +105,7 @@ def transfer_labels(
         raise AlignmentError("no occupied cell of the map carries a class; annotate the map first")
     labels = np.full(batch.ranges.shape, UNLABELLED, np.uint8)
     confidence = np.zeros_like(labels)
+    no_return = UNLABELLED if transfer.ignore_no_return else taxonomy.background_id
     _transfer(
         *beams_of(batch, batch.valid),
         compose(invert(field.origin.as_array()), poses),
@@ -106,9 +115,10 @@ def transfer_labels(
         field.border_m,
         field.nearest_label,
         field.free,
+        np.full(field.free.shape, UNLABELLED, np.uint8) if things is None else things,
         field.resolution,
-        np.array(astuple(transfer)),
-        np.array((taxonomy.background_id, taxonomy.id_of("Person")), np.uint8),
+        np.array((transfer.object_m, transfer.sure_m)),
+        np.array((no_return, taxonomy.background_id, taxonomy.id_of("Person")), np.uint8),
         labels,
         confidence,
     )
@@ -128,6 +138,7 @@ def _transfer(
     border_m: NDArray[np.float32],
     nearest_label: Labels,
     free: NDArray[np.bool_],
+    things: Labels,
     resolution: float,
     limits: Float,
     special: Labels,
@@ -135,11 +146,11 @@ def _transfer(
     confidence: Labels,
 ) -> None:
     object_m, sure_m = limits
-    other, person = special
+    no_return, other, person = special
     for n in numba.prange(ranges.shape[0]):
         if not accepted[n]:
             continue
-        labels[n] = other
+        labels[n] = no_return
         points = base_points(ranges[n], valid[n], directions, offset)
         c, s = np.cos(poses[n, 2]), np.sin(poses[n, 2])
         p = -1
@@ -152,11 +163,15 @@ def _transfer(
             column, row = int(np.floor(x / resolution)), int(np.floor(y / resolution))
             inside = 0 <= row < free.shape[0] and 0 <= column < free.shape[1]
             sure = 1.0
+            labels[n, k] = other
             if inside and distance_m[row, column] <= object_m:
                 if nearest_label[row, column] != UNLABELLED:
                     labels[n, k] = nearest_label[row, column]
                     sure = 1.0 - 0.5 * distance_m[row, column] / object_m
                     sure *= 0.5 + 0.5 * min(1.0, border_m[row, column] / sure_m)
+            elif inside and things[row, column] != UNLABELLED:
+                labels[n, k] = things[row, column]
+                sure = 0.5
             elif inside and free[row, column]:
                 labels[n, k] = person
                 sure = 0.5 + 0.5 * min(1.0, (distance_m[row, column] - object_m) / sure_m)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,38 +17,37 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 import semantic2d_dataset
-from salsa.alignment import TRUSTED, Acceptance, Alignment, align, check_inside, corrections, fit
-from salsa.annotation import annotate_map
-from salsa.fields import MapField, map_field
-from salsa.labelling import DEFAULT_TRANSFER, Transfer, transfer_labels
-from salsa.persistence import HitCounter, Persistence
+from salsa.alignment import Alignment, check_inside, corrections
+from salsa.blocks import (
+    BLOCK_SCANS,
+    Block,
+    Job,
+    align_block,
+    blocks_of,
+    gather_block,
+    joined,
+    label_block,
+    prepare,
+    rough_poses,
+    rows_of,
+)
+from salsa.evidence import Ledger, coarse
+from salsa.settings import Settings
+from salsa.things import NO_THINGS, Things, find_things
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
-from semantic2d_dataset.format.schema import CHUNK_ROWS
+from semantic2d_dataset.executors import Executor, Serial
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
-from semantic2d_dataset.scene.lines import PUBLISHED, LineParameters, extract_lines
 from semantic2d_dataset.scene.maps import map_image
-from semantic2d_dataset.scene.scans import ScanBatch
 from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
-
-BLOCK_SCANS = 8 * CHUNK_ROWS
-"""Scans in memory at a time; neighbours help each other within a block, and forward beyond it."""
 
 MIN_ACCEPTED_SHARE = 1 / 3
 """Of the scans with a pose: below it the map is not that of the recording."""
 
+Facts = dict[str, Any]
+
 _OURS = ("scans/labels", "scans/confidence", "poses/refined", "provenance")
 _OUR_GROUPS = ("alignment/", "lines/", "map/")
 _PER_SCAN_GROUPS = ("scans/", "poses/", "commands/")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Parameters of all steps; `persistence` None leaves unmapped static things as Person."""
-
-    lines: LineParameters = PUBLISHED
-    acceptance: Acceptance = TRUSTED
-    transfer: Transfer = DEFAULT_TRANSFER
-    persistence: Persistence | None = None
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ class Summary:
     near_before, near_after
         Median over the scans with a pose: share of points near (Acceptance.inlier_m) a mapped
         object, at the rough and at the refined poses.
-    static_cells
-        Map cells that hold something unmapped which stays.
+    things, things_moved, standing
+        Unmapped things that stay, how many of them are mapped objects that were moved, and how
+        many outlines were taken for people who stand.
     points
         Labelled beams by class name; beams of scans not accepted under ``unlabelled``.
     """
@@ -74,7 +76,9 @@ class Summary:
     median_residual_m: float
     near_before: float
     near_after: float
-    static_cells: int
+    things: int
+    things_moved: int
+    standing: int
     points: dict[str, int]
 
 
@@ -86,6 +90,7 @@ def label_sequence(
     *,
     settings: Settings | None = None,
     force: bool = False,
+    executor: Executor | None = None,
 ) -> Summary:
     """Write a labelled copy of a sequence.
 
@@ -104,6 +109,9 @@ def label_sequence(
         Parameters of all steps.
     force
         Replace `out` where it exists.
+    executor
+        Where blocks of scans are worked on; the result is the same. This process, with all its
+        cores, unless given.
 
     Raises
     ------
@@ -117,21 +125,26 @@ def label_sequence(
     source, out, settings = Path(source), Path(out), settings or Settings()
     inputs = input_files(source, map_yaml, annotation)
     check_target(out, inputs.values(), force=force)
-    with SequenceReader(source) as reader:
-        taxonomy = reader.header.taxonomy
-        scene = annotate_map(map_yaml, annotation, taxonomy)
-        field = map_field(scene, taxonomy)
-        check_inside(_rough_poses(reader, 0, len(reader)), field)
-        said = _provenance(inputs, settings)
-        header = replace(reader.header, provenance=dict(reader.header.provenance) | {"salsa": said})
+    facts = salsa_facts(source, map_yaml, annotation, settings)
+    files = [path.resolve() for path in (source, Path(map_yaml), Path(annotation))]
+    job = Job(files[0], files[1], files[2], settings, _digest(facts))
+    prepared, run = prepare(job), executor or Serial()
+    reader = prepared.reader
+    try:
+        check_inside(rough_poses(reader, 0, len(reader)), prepared.field)
+        provenance = dict(reader.header.provenance) | {"salsa": facts}
+        header = replace(reader.header, provenance=provenance)
         with tqdm(total=2 * len(reader), desc=source.name, unit="scan", disable=None) as bar:
-            found = _align_all(reader, field, settings, bar)
-            _check_fit(source, found)
+            found, near_before = _align_all(job, run, bar)
+            _check_fit(source, found, corrections(rough_poses(reader, 0, len(reader)), found.poses))
+            things = _find_things(job, found, run)
             with SequenceWriter(out, header) as writer:
-                counts = _write_all(reader, writer, found, settings, bar)
+                counts = _write_all(job, writer, found, things, run, bar)
                 _copy_other_arrays(reader, writer)
-                writer.set_map(scene)
-    return _summarise(found, counts, taxonomy)
+                writer.set_map(prepared.scene)
+        return _summarise(found, near_before, things, counts, reader.header.taxonomy)
+    finally:
+        reader.close()
 
 
 def input_files(source: Path, map_yaml: Path, annotation: Path) -> dict[str, Path]:
@@ -148,6 +161,34 @@ def input_files(source: Path, map_yaml: Path, annotation: Path) -> dict[str, Pat
         "map_image": map_image(map_yaml),
         "annotation": Path(annotation),
     }
+
+
+def salsa_facts(
+    source: Path, map_yaml: Path, annotation: Path, settings: Settings | None = None
+) -> Facts:
+    """Return what a labelling depends on: inputs with SHA-256, parameters, versions.
+
+    A labelled sequence has it in its provenance, under ``salsa``.
+
+    Raises
+    ------
+    FileNotFoundError, InvalidInputError
+        As `input_files`, and if another file is missing.
+    """
+    inputs = input_files(source, map_yaml, annotation)
+    facts = {
+        "inputs": {
+            role: {"name": path.name, "sha256": _sha256(path)} for role, path in inputs.items()
+        },
+        "parameters": asdict(settings or Settings()) | {"block_scans": BLOCK_SCANS},
+        "versions": {
+            "semantic2d-dataset": semantic2d_dataset.__version__,
+            "numpy": np.__version__,
+            "numba": numba.__version__,
+            "scipy": scipy.__version__,
+        },
+    }
+    return dict(json.loads(json.dumps(facts)))  # as it is read back
 
 
 def check_target(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
@@ -176,119 +217,90 @@ def _same(one: Path, other: Path) -> bool:
     return one.resolve() == other.resolve()
 
 
-@dataclass(frozen=True)
-class _Found:
-    """What the first pass learns: a few numbers per scan, and where unmapped things stay."""
-
-    alignment: Alignment
-    correction_m: NDArray[np.float64]
-    near_before: NDArray[np.float32]
-    field: MapField
-    static_cells: int
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Which scans have a pose, (N,) bool."""
-        return np.asarray(np.isfinite(self.alignment.poses).all(axis=-1))
+def _align_all(job: Job, run: Executor, bar: tqdm[Any]) -> tuple[Alignment, NDArray[np.float32]]:
+    """Align all blocks; also return the share of points near the map at the rough poses (N,)."""
+    parts, near_before = [], []
+    blocks = blocks_of(len(prepare(job).reader))
+    for block, (found, near) in zip(
+        blocks, run.map(partial(align_block, job), blocks), strict=True
+    ):
+        parts.append(found)
+        near_before.append(near)
+        bar.update(block.stop - block.start)
+    return _help_on(job, blocks, parts, run), np.concatenate(near_before)
 
 
-def _align_all(
-    reader: SequenceReader, field: MapField, settings: Settings, bar: tqdm[Any]
-) -> _Found:
-    """First pass: align block after block, and count what stays in free space."""
-    counter = HitCounter(field, settings.transfer.object_m) if settings.persistence else None
-    parts: list[Alignment] = []
-    near_before: list[NDArray[np.float32]] = []
-    moved: list[NDArray[np.float64]] = []
-    before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-    for start, stop in _blocks(len(reader)):
-        batch = _rough_batch(reader, start, stop)
-        part = align(batch, field, acceptance=settings.acceptance, before=before)
-        if counter is not None:
-            counter.add(batch, part.poses, part.accepted)
-        if part.accepted.any():
-            last = int(np.flatnonzero(part.accepted)[-1])
-            before = part.poses[last], batch.poses[last]
-        parts.append(part)
-        near_before.append(fit(batch, batch.poses, field, settings.acceptance.inlier_m)[1])
-        moved.append(corrections(batch.poses, part.poses))
-        bar.update(stop - start)
-    static = (field, 0)
-    if counter is not None and settings.persistence is not None:
-        static = counter.without_static(settings.persistence)
-    return _Found(_joined(parts), np.concatenate(moved), np.concatenate(near_before), *static)
+def _help_on(job: Job, blocks: list[Block], parts: list[Alignment], run: Executor) -> Alignment:
+    """Align blocks of which little fits once more, from where the block before them ended."""
+    reader = prepare(job).reader
+    for number in range(1, len(blocks)):
+        block, last = blocks[number], np.flatnonzero(parts[number - 1].accepted)
+        known = np.isfinite(parts[number].poses).all(axis=-1)
+        if not len(last) or parts[number].accepted[known].all():
+            continue
+        at = blocks[number - 1].start + int(last[-1])
+        before = np.stack((parts[number - 1].poses[last[-1]], rough_poses(reader, at, at + 1)[0]))
+        ((found, _),) = run.map(partial(align_block, job), [replace(block, before=before)])
+        if found.accepted.sum() > parts[number].accepted.sum():
+            parts[number] = found
+    return joined(parts)
+
+
+def _find_things(job: Job, found: Alignment, run: Executor) -> Things:
+    """Find what stays in free space, from what all blocks saw."""
+    persistence, field = job.settings.persistence, prepare(job).field
+    if persistence is None:
+        return NO_THINGS
+    ledger = Ledger(coarse(field)[1])
+    for evidence in run.map(partial(gather_block, job), _with_alignment(job, found)):
+        ledger.add(evidence)
+    taxonomy = prepare(job).reader.header.taxonomy
+    return find_things(ledger, field, job.settings.transfer.object_m, persistence, taxonomy)
+
+
+def _with_alignment(job: Job, found: Alignment) -> Iterable[Block]:
+    blocks = blocks_of(len(prepare(job).reader))
+    return (replace(block, found=rows_of(found, block)) for block in blocks)
 
 
 def _write_all(
-    reader: SequenceReader,
+    job: Job,
     writer: SequenceWriter,
-    found: _Found,
-    settings: Settings,
+    found: Alignment,
+    things: Things,
+    run: Executor,
     bar: tqdm[Any],
 ) -> NDArray[np.int64]:
-    """Second pass: lines, labels and what the source had; returns beams per label (256,)."""
+    """Write labels, lines and what the source had, in order; return beams per label (256,)."""
+    reader = prepare(job).reader
     counts = np.zeros(256, np.int64)
-    lines_before = 0
-    for start, stop in _blocks(len(reader)):
-        batch = _rough_batch(reader, start, stop)
-        part = _rows(found.alignment, slice(start, stop))
-        labels, confidence = transfer_labels(
-            batch,
-            part.poses,
-            found.field,
-            part.accepted,
-            quality=part.inlier_ratio,
-            transfer=settings.transfer,
-            taxonomy=reader.header.taxonomy,
-        )
-        segments, offsets = _lines_of(batch, settings.lines)
-        copied = {name: reader.read(name, start, stop) for name in reader.names if _is_kept(name)}
-        writer.append(
-            copied
-            | {
-                "scans/labels": labels,
-                "scans/confidence": confidence,
-                "poses/refined": part.poses,
-                "alignment/residual_m": part.residual_m,
-                "alignment/inlier_ratio": part.inlier_ratio,
-                "alignment/accepted": part.accepted.astype(np.uint8),
-                "alignment/covariance": part.covariance,
-                "lines/segments": segments,
-                "lines/offsets": (offsets if start == 0 else offsets[1:]) + lines_before,
-            }
-        )
-        lines_before += len(segments)
-        counts += np.bincount(labels[batch.valid | (labels == UNLABELLED)], minlength=256)
-        bar.update(stop - start)
+    lines = 0
+    blocks = blocks_of(len(reader))
+    results = run.map(partial(label_block, job, things), _with_alignment(job, found))
+    for block, arrays in zip(blocks, results, strict=True):
+        labels, offsets = arrays["scans/labels"], arrays["lines/offsets"]
+        copied = {
+            name: reader.read(name, block.start, block.stop)
+            for name in reader.names
+            if _is_kept(name)
+        }
+        arrays["lines/offsets"] = (offsets if block.start == 0 else offsets[1:]) + lines
+        writer.append(copied | arrays | _alignment_arrays(rows_of(found, block)))
+        lines += len(arrays["lines/segments"])
+        returned = reader.lidar.has_return(copied["scans/ranges"])
+        counts += np.bincount(labels[returned | (labels == UNLABELLED)], minlength=256)
+        bar.update(block.stop - block.start)
     return counts
 
 
-def _blocks(scans: int) -> list[tuple[int, int]]:
-    return [(start, min(start + BLOCK_SCANS, scans)) for start in range(0, scans, BLOCK_SCANS)]
-
-
-def _rough_batch(reader: SequenceReader, start: int, stop: int) -> ScanBatch:
-    """Read scans with the poses that they had before any alignment."""
-    return replace(reader.batch(start, stop), poses=_rough_poses(reader, start, stop))
-
-
-def _rough_poses(reader: SequenceReader, start: int, stop: int) -> NDArray[np.float64]:
-    if "poses/initial" in reader:
-        return reader.read("poses/initial", start, stop)
-    return reader.read_poses(start, stop)
-
-
-def _lines_of(
-    batch: ScanBatch, parameters: LineParameters
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    lidar = batch.lidar
-    return extract_lines(
-        batch.ranges,
-        lidar.bearings,
-        parameters,
-        range_min=lidar.range_min,
-        range_max=lidar.range_max,
-    )
+def _alignment_arrays(found: Alignment) -> dict[str, NDArray[Any]]:
+    return {
+        "poses/refined": found.poses,
+        "alignment/residual_m": found.residual_m,
+        "alignment/inlier_ratio": found.inlier_ratio,
+        "alignment/accepted": found.accepted.astype(np.uint8),
+        "alignment/covariance": found.covariance,
+    }
 
 
 def _is_kept(name: str) -> bool:
@@ -306,51 +318,22 @@ def _copy_other_arrays(reader: SequenceReader, writer: SequenceWriter) -> None:
             writer.append({name: reader.read(name, start, min(start + BLOCK_SCANS, rows))})
 
 
-def _joined(parts: list[Alignment]) -> Alignment:
-    return Alignment(
-        *(
-            np.concatenate([getattr(part, each.name) for part in parts])
-            for each in fields(Alignment)
-        )
-    )
-
-
-def _rows(alignment: Alignment, rows: slice) -> Alignment:
-    return Alignment(*(getattr(alignment, each.name)[rows] for each in fields(Alignment)))
-
-
-def _check_fit(source: Path, found: _Found) -> None:
+def _check_fit(source: Path, found: Alignment, moved_m: NDArray[np.float64]) -> None:
     """Refuse to call a recording from elsewhere a crowd."""
-    known, accepted = found.known, found.alignment.accepted
+    known = np.isfinite(found.poses).all(axis=-1)
     if not known.any():
         raise AlignmentError(
             f"{source}: no scan has a pose, so alignment has nowhere to start; convert the "
             f"recording with its amcl pose or tf"
         )
-    if accepted.sum() < MIN_ACCEPTED_SHARE * known.sum():
-        near = np.median(found.alignment.inlier_ratio[known])
-        moved = np.median(found.correction_m[known])
+    if found.accepted.sum() < MIN_ACCEPTED_SHARE * known.sum():
+        near, moved = np.median(found.inlier_ratio[known]), np.median(moved_m[known])
         raise AlignmentError(
-            f"{source}: the scans do not fit the map: {accepted.sum()} of {known.sum()} scans "
-            f"accepted; the median scan fits best {moved:.1f} m from its rough pose, with "
+            f"{source}: the scans do not fit the map: {found.accepted.sum()} of {known.sum()} "
+            f"scans accepted; the median scan fits best {moved:.1f} m from its rough pose, with "
             f"{100 * near:.0f} % of its points near a mapped object; check that map, scan topic "
             f"and mount belong together"
         )
-
-
-def _provenance(inputs: dict[str, Path], settings: Settings) -> dict[str, Any]:
-    return {
-        "inputs": {
-            role: {"name": path.name, "sha256": _sha256(path)} for role, path in inputs.items()
-        },
-        "parameters": asdict(settings) | {"block_scans": BLOCK_SCANS},
-        "versions": {
-            "semantic2d-dataset": semantic2d_dataset.__version__,
-            "numpy": np.__version__,
-            "numba": numba.__version__,
-            "scipy": scipy.__version__,
-        },
-    }
 
 
 def _sha256(path: Path) -> str:
@@ -358,16 +341,28 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _summarise(found: _Found, counts: NDArray[np.int64], taxonomy: Taxonomy) -> Summary:
-    alignment, known = found.alignment, found.known
+def _digest(facts: Facts) -> str:
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _summarise(
+    found: Alignment,
+    near_before: NDArray[np.float32],
+    things: Things,
+    counts: NDArray[np.int64],
+    taxonomy: Taxonomy,
+) -> Summary:
+    known = np.isfinite(found.poses).all(axis=-1)
     names = {**dict(enumerate(taxonomy.names)), UNLABELLED: "unlabelled"}
     return Summary(
-        scans=len(alignment),
+        scans=len(found),
         scans_with_pose=int(known.sum()),
-        scans_accepted=int(alignment.accepted.sum()),
-        median_residual_m=float(np.median(alignment.residual_m[alignment.accepted])),
-        near_before=float(np.median(found.near_before[known])),
-        near_after=float(np.median(alignment.inlier_ratio[known])),
-        static_cells=found.static_cells,
+        scans_accepted=int(found.accepted.sum()),
+        median_residual_m=float(np.median(found.residual_m[found.accepted])),
+        near_before=float(np.median(near_before[known])),
+        near_after=float(np.median(found.inlier_ratio[known])),
+        things=things.things,
+        things_moved=things.moved,
+        standing=things.standing,
         points={name: int(counts[label]) for label, name in names.items()},
     )

@@ -53,7 +53,11 @@ def test_limits_of_static_things_reach_the_provenance(words, tmp_path):
     assert result.exit_code == 0, result.output
     with SequenceReader(tmp_path / "out.h5") as reader:
         said = reader.header.provenance["salsa"]["parameters"]["persistence"]
-    assert said == {"min_seconds": 30, "min_hits": 150}
+    assert said["min_seconds"] == 30
+    result = CliRunner().invoke(app, [*words, "--static-after", "0", "--force"])
+    assert result.exit_code == 0, result.output
+    with SequenceReader(tmp_path / "out.h5") as reader:
+        assert reader.header.provenance["salsa"]["parameters"]["persistence"] is None
 
 
 @pytest.mark.parametrize("name", ["in.h5", "room.yaml", "room.pgm", "none/a.png", "a.bmpx"])

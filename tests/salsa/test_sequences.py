@@ -3,9 +3,12 @@ import hashlib
 import numpy as np
 import pytest
 
-from salsa import sequences
+from salsa import blocks
+from salsa.alignment import Acceptance
 from salsa.sequences import label_sequence
+from salsa.settings import Settings
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
+from semantic2d_dataset.executors import Processes
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
 from tests.salsa import rooms
@@ -91,11 +94,11 @@ def test_the_provenance_names_inputs_by_their_digest(room, labelled):
 
 def test_blocks_change_no_line_and_no_label(room, labelled, monkeypatch):
     folder, map_yaml, annotation = room
-    monkeypatch.setattr(sequences, "BLOCK_SCANS", 64)
+    monkeypatch.setattr(blocks, "BLOCK_SCANS", 64)
     out = folder / "blocks.h5"
     label_sequence(folder / "source.h5", map_yaml, annotation, out)
-    with SequenceReader(out) as blocks, SequenceReader(labelled[0]) as whole:
-        assert blocks.content_digest() == whole.content_digest()
+    with SequenceReader(out) as divided, SequenceReader(labelled[0]) as whole:
+        assert divided.content_digest() == whole.content_digest()
 
 
 def test_labelling_twice_gives_the_same(room, labelled):
@@ -160,7 +163,7 @@ def test_blocks_outside_the_map_are_left_unlabelled_but_not_all_may_be(room, tmp
     truth = rooms.true_poses(8)
     rough = truth + np.where(np.arange(8) < 4, 0.0, 500.0)[:, None] * (1, 0, 0)
     write_source(tmp_path / "half.h5", rooms.batch_at(truth, rough))
-    monkeypatch.setattr(sequences, "BLOCK_SCANS", 4)
+    monkeypatch.setattr(blocks, "BLOCK_SCANS", 4)
     summary = label_sequence(tmp_path / "half.h5", map_yaml, annotation, tmp_path / "out.h5")
     assert (summary.scans_with_pose, summary.scans_accepted) == (8, 4)
     write_source(tmp_path / "none.h5", rooms.batch_at(truth, truth + 500.0))
@@ -168,7 +171,48 @@ def test_blocks_outside_the_map_are_left_unlabelled_but_not_all_may_be(room, tmp
         label_sequence(tmp_path / "none.h5", map_yaml, annotation, tmp_path / "no.h5")
 
 
-def test_hits_are_counted_only_for_those_who_ask(room, tmp_path, monkeypatch):
+def test_without_persistence_nothing_is_gathered(room, tmp_path, monkeypatch):
     folder, map_yaml, annotation = room
-    monkeypatch.setattr(sequences, "HitCounter", None)
-    label_sequence(folder / "source.h5", map_yaml, annotation, tmp_path / "out.h5")
+    monkeypatch.setattr(blocks, "gather", None)
+    settings = Settings(persistence=None)
+    label_sequence(
+        folder / "source.h5", map_yaml, annotation, tmp_path / "out.h5", settings=settings
+    )
+    with pytest.raises(TypeError):
+        label_sequence(folder / "source.h5", map_yaml, annotation, tmp_path / "more.h5")
+
+
+def test_a_drift_is_followed_from_block_to_block(room, tmp_path, monkeypatch):
+    _, map_yaml, annotation = room
+    monkeypatch.setattr(blocks, "BLOCK_SCANS", 16)
+    truth = rooms.true_poses(80)
+    drift = np.linspace(0, 1, 80)[:, None] * np.array((1.6, -1.2, 0.6))
+    write_source(tmp_path / "in.h5", rooms.batch_at(truth, truth + drift))
+    settings = Settings(acceptance=Acceptance(max_correction_m=2.1))
+    summary = label_sequence(
+        tmp_path / "in.h5", map_yaml, annotation, tmp_path / "out.h5", settings=settings
+    )
+    assert summary.scans_accepted == 80
+    with SequenceReader(tmp_path / "out.h5") as reader:
+        assert rooms.errors(reader.read("poses/refined"), truth)[0].max() < 0.05
+
+
+def test_processes_label_as_one_does(room, labelled, tmp_path):
+    folder, map_yaml, annotation = room
+    out = tmp_path / "out.h5"
+    with Processes(2) as executor:
+        label_sequence(folder / "source.h5", map_yaml, annotation, out, executor=executor)
+    with SequenceReader(out) as one, SequenceReader(labelled[0]) as other:
+        assert one.content_digest() == other.content_digest()
+
+
+def test_a_file_that_changed_is_read_anew(room, labelled, tmp_path):
+    """What is kept between blocks is kept by what the files hold, not by their names."""
+    _, map_yaml, annotation = room
+    truth = rooms.true_poses(6)
+    for poses in (truth, truth[::-1]):
+        (tmp_path / "in.h5").unlink(missing_ok=True)
+        write_source(tmp_path / "in.h5", rooms.batch_at(poses, poses))
+        label_sequence(tmp_path / "in.h5", map_yaml, annotation, tmp_path / "out.h5", force=True)
+        with SequenceReader(tmp_path / "out.h5") as reader:
+            assert rooms.errors(reader.read("poses/refined"), poses)[0].max() < 0.05

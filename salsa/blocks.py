@@ -1,0 +1,165 @@
+"""The work on one block of scans: pure functions that run here, in processes or on a cluster.
+
+Each takes a `Job` that names the files, so that little travels; whoever runs it reads them once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from salsa.alignment import Alignment, align, fit
+from salsa.annotation import annotate_map
+from salsa.evidence import Evidence, gather
+from salsa.fields import MapField, map_field
+from salsa.labelling import transfer_labels
+from salsa.settings import Settings
+from salsa.things import Things
+from semantic2d_dataset.format.schema import CHUNK_ROWS
+from semantic2d_dataset.format.sequence import SequenceReader
+from semantic2d_dataset.scene.lines import extract_lines
+from semantic2d_dataset.scene.maps import SemanticMap
+from semantic2d_dataset.scene.scans import ScanBatch
+
+BLOCK_SCANS = 8 * CHUNK_ROWS
+"""Scans in memory at a time; neighbours help each other within a block."""
+
+Float = NDArray[np.float64]
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One sequence to label: its file, its map and annotation, and the parameters of all steps.
+
+    `digest` is that of what the files hold, so that a changed file is another job.
+    """
+
+    source: Path
+    map_yaml: Path
+    annotation: Path
+    settings: Settings
+    digest: str
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What the files of a job hold."""
+
+    reader: SequenceReader
+    scene: SemanticMap
+    field: MapField
+
+
+@dataclass(frozen=True)
+class Block:
+    """Scans `start` to `stop`, and what is known of them so far.
+
+    Parameters
+    ----------
+    before
+        Refined and rough pose (2, 3) of a trusted scan before them.
+    found
+        Their alignment.
+    """
+
+    start: int
+    stop: int
+    before: Float | None = None
+    found: Alignment | None = None
+
+
+@lru_cache(maxsize=1)
+def prepare(job: Job) -> Prepared:
+    """Open the sequence of a job and measure its map; kept for the next block of the same job."""
+    reader = SequenceReader(job.source)
+    taxonomy = reader.header.taxonomy
+    scene = annotate_map(job.map_yaml, job.annotation, taxonomy)
+    return Prepared(reader, scene, map_field(scene, taxonomy))
+
+
+def blocks_of(scans: int) -> list[Block]:
+    """Divide a sequence; the division is the same wherever the work is done."""
+    starts = range(0, scans, BLOCK_SCANS)
+    return [Block(start, min(start + BLOCK_SCANS, scans)) for start in starts]
+
+
+def align_block(job: Job, block: Block) -> tuple[Alignment, NDArray[np.float32]]:
+    """Align scans; also return the share of their points near the map at the rough poses (n,)."""
+    prepared, acceptance = prepare(job), job.settings.acceptance
+    batch = rough_batch(prepared.reader, block)
+    found = align(batch, prepared.field, acceptance=acceptance, before=block.before)
+    return found, fit(batch, batch.poses, prepared.field, acceptance.inlier_m)[1]
+
+
+def gather_block(job: Job, block: Block) -> Evidence:
+    """Count what stays in free space and what does not."""
+    prepared, found = prepare(job), aligned(block)
+    batch = rough_batch(prepared.reader, block)
+    return gather(batch, found.poses, found.accepted, prepared.field)
+
+
+def label_block(job: Job, things: Things, block: Block) -> Arrays:
+    """Label scans, and extract their lines: arrays by their names in the sequence."""
+    prepared, found = prepare(job), aligned(block)
+    batch = rough_batch(prepared.reader, block)
+    labels, confidence = transfer_labels(
+        batch,
+        found.poses,
+        prepared.field,
+        found.accepted,
+        quality=found.inlier_ratio,
+        things=things.layer(prepared.field.free.shape),
+        transfer=job.settings.transfer,
+        taxonomy=prepared.reader.header.taxonomy,
+    )
+    segments, offsets = extract_lines(
+        batch.ranges,
+        batch.lidar.bearings,
+        job.settings.lines,
+        range_min=batch.lidar.range_min,
+        range_max=batch.lidar.range_max,
+    )
+    return {
+        "scans/labels": labels,
+        "scans/confidence": confidence,
+        "lines/segments": segments,
+        "lines/offsets": offsets,
+    }
+
+
+def aligned(block: Block) -> Alignment:
+    """Return the alignment of a block that has one."""
+    if block.found is None:
+        raise ValueError(f"scans {block.start} to {block.stop} are not aligned yet")
+    return block.found
+
+
+def rough_batch(reader: SequenceReader, block: Block) -> ScanBatch:
+    """Read scans with the poses that they had before any alignment."""
+    batch = reader.batch(block.start, block.stop)
+    return replace(batch, poses=rough_poses(reader, block.start, block.stop))
+
+
+def rough_poses(reader: SequenceReader, start: int, stop: int) -> Float:
+    """Read the poses (n, 3) that scans had before any alignment, NaN where unknown."""
+    if "poses/initial" in reader:
+        return reader.read("poses/initial", start, stop)
+    return reader.read_poses(start, stop)
+
+
+def joined(parts: list[Alignment]) -> Alignment:
+    """Join the alignments of blocks."""
+    names = [each.name for each in fields(Alignment)]
+    return Alignment(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def rows_of(alignment: Alignment, block: Block) -> Alignment:
+    """Return the alignment of the scans of a block."""
+    rows = slice(block.start, block.stop)
+    return Alignment(*(getattr(alignment, each.name)[rows] for each in fields(Alignment)))

@@ -1,0 +1,84 @@
+"""Parameters of all steps of SALSA, and how they are read from plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from typing import Any
+
+from salsa.alignment import TRUSTED, Acceptance
+from salsa.labelling import DEFAULT_TRANSFER, Transfer
+from salsa.things import DEFAULT_PERSISTENCE, Persistence
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.lines import PUBLISHED, LineParameters
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Parameters of all steps; None leaves `persistence` out: what stays is called Person then."""
+
+    lines: LineParameters = PUBLISHED
+    acceptance: Acceptance = TRUSTED
+    persistence: Persistence | None = DEFAULT_PERSISTENCE
+    transfer: Transfer = DEFAULT_TRANSFER
+
+
+_STEPS: dict[str, type] = {
+    "lines": LineParameters,
+    "acceptance": Acceptance,
+    "persistence": Persistence,
+    "transfer": Transfer,
+}
+
+
+def settings_from(values: Mapping[str, Any]) -> Settings:
+    """Build settings from plain values, as a YAML file holds them.
+
+    Parameters
+    ----------
+    values
+        By step, then by parameter: ``{"persistence": {"min_seconds": 10}}``; what is not named
+        keeps its default, and ``{"persistence": None}`` leaves that step out.
+
+    Raises
+    ------
+    InvalidInputError
+        If a step or a parameter is unknown, or a value is not one that it can have.
+    """
+    return Settings(**{name: _step(name, value) for name, value in values.items()})
+
+
+def _step(name: str, values: Any) -> Any:
+    if name not in _STEPS:
+        raise InvalidInputError(f"salsa: {_unknown(name, list(_STEPS))}")
+    if values is None and name == "persistence":
+        return None
+    kind = _STEPS[name]
+    if not isinstance(values, Mapping):
+        raise InvalidInputError(f"salsa: {name}: expected a mapping, found {values!r}")
+    known = {each.name: each.default for each in fields(kind)}
+    for key, value in values.items():
+        if key not in known:
+            raise InvalidInputError(f"salsa: {name}: {_unknown(key, list(known))}")
+        if not _is_like(value, known[key]):
+            raise InvalidInputError(
+                f"salsa: {name}: {key}: expected a value like {known[key]!r}, found {value!r}"
+            )
+    return kind(
+        **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    )
+
+
+def _is_like(value: Any, example: Any) -> bool:
+    if isinstance(example, tuple):
+        return isinstance(value, list | tuple) and all(isinstance(each, str) for each in value)
+    if isinstance(example, float):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is type(example)
+
+
+def _unknown(name: object, known: list[str]) -> str:
+    near = get_close_matches(str(name), known, n=1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"unknown key {name!r}{hint} (known are {', '.join(known)})"

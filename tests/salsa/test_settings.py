@@ -1,0 +1,41 @@
+import pytest
+
+from salsa.settings import Settings, settings_from
+from salsa.things import Persistence
+from semantic2d_dataset.errors import InvalidInputError
+
+
+def test_nothing_said_is_the_default():
+    assert settings_from({}) == Settings()
+
+
+def test_what_is_said_takes_the_place_of_the_default():
+    found = settings_from(
+        {
+            "persistence": {"min_seconds": 9, "movable": ["Chair"]},
+            "acceptance": {"max_correction_m": 3},
+            "transfer": {"ignore_no_return": True},
+        }
+    )
+    assert found.persistence == Persistence(min_seconds=9, movable=("Chair",))
+    assert found.acceptance.max_correction_m == 3
+    assert found.transfer.ignore_no_return
+    assert settings_from({"persistence": None}).persistence is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"persistance": {}}, "unknown key 'persistance'; did you mean persistence"),
+        ({"transfer": {"object": 0.1}}, "transfer: unknown key 'object'; did you mean object_m"),
+        ({"transfer": {"object_m": "near"}}, "object_m: expected a value like 0.15, found 'near'"),
+        ({"transfer": {"ignore_no_return": 1}}, "expected a value like False, found 1"),
+        ({"persistence": {"movable": "Chair"}}, "movable: expected a value like"),
+        ({"persistence": {"min_seconds": 2.5}}, "min_seconds: expected a value like 5"),
+        ({"acceptance": None}, "acceptance: expected a mapping, found None"),
+        ({"acceptance": {"inlier_m": 7.0}}, "acceptance limits"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_name(values, message):
+    with pytest.raises(InvalidInputError, match=message):
+        settings_from(values)
