@@ -6,21 +6,19 @@ every cell in them belongs to it: only occupied cells take a class.
 
 from __future__ import annotations
 
-import base64
 import io
-import json
-import math
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import Image
 from scipy import ndimage
 
+from salsa.shapes import Shape, check_size, paint, read_shapes
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError
+from semantic2d_dataset.format.writing import write_bytes_atomically
 from semantic2d_dataset.scene.maps import FREE, OCCUPIED, SemanticMap, read_map
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED, Taxonomy
 
@@ -29,18 +27,24 @@ Labels = NDArray[np.uint8]
 MARGIN_M = 0.1
 """An occupied cell this near to a labelled one takes its class: shapes often miss an edge."""
 
-_STROKE_PIXELS = 3  # width of drawn lines and points; they mark objects, they have no area
-_MAX_DIAGONALS = 10
-_FEWEST_POINTS = {
-    "polygon": 3,
-    "rectangle": 2,
-    "circle": 2,
-    "line": 2,
-    "linestrip": 2,
-    "point": 1,
-    "points": 1,
-    "mask": 1,
-}
+_ID_MODES = ("1", "L", "P", "I", "I;16", "I;16B")
+_WHITE = (255, 255, 255)
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """What somebody said about the image of a map.
+
+    Parameters
+    ----------
+    regions
+        (H, W) u1 class ids, 255 where nothing was said; row 0 is the smallest y.
+    shapes
+        The labelme shapes that the regions were drawn from; none where they came from an image.
+    """
+
+    regions: Labels
+    shapes: tuple[Shape, ...]
 
 
 def annotate_map(map_yaml: Path, annotation: Path, taxonomy: Taxonomy = SEMANTIC2D) -> SemanticMap:
@@ -59,8 +63,8 @@ def annotate_map(map_yaml: Path, annotation: Path, taxonomy: Taxonomy = SEMANTIC
     Returns
     -------
     SemanticMap
-        Occupied cells carry their class. Cells annotated as Person are free: a person who stood
-        there during mapping is no object.
+        Occupied cells carry their class. Cells annotated as Person are free, whatever the map has
+        there: a person who stood there during mapping is no object.
 
     Raises
     ------
@@ -69,21 +73,19 @@ def annotate_map(map_yaml: Path, annotation: Path, taxonomy: Taxonomy = SEMANTIC
     InvalidInputError
         If a file cannot be understood, a class is unknown, or the sizes differ.
     AlignmentError
-        If no occupied cell takes a class.
+        If no cell is occupied, or none takes a class.
     """
     scene = read_map(Path(map_yaml))
-    regions = read_annotation(Path(annotation), scene.occupancy.shape, taxonomy)
-    labelled = label_cells(scene, regions, taxonomy)
-    if (labelled.labels == UNLABELLED).all():
-        raise AlignmentError(
-            f"{annotation}: no occupied cell of {map_yaml} lies in a labelled shape, so there is "
-            f"nothing to transfer; is it the annotation of this map?"
-        )
+    said = read_annotation(Path(annotation), scene.occupancy.shape, taxonomy)
+    labelled = label_cells(scene, said.regions, taxonomy)
+    check_labelled(labelled, map_yaml, annotation, taxonomy)
     return labelled
 
 
-def read_annotation(path: Path, shape: tuple[int, ...], taxonomy: Taxonomy = SEMANTIC2D) -> Labels:
-    """Return the class of every pixel, (H, W) u1 with row 0 at the smallest y, 255 for none.
+def read_annotation(
+    path: Path, shape: tuple[int, ...], taxonomy: Taxonomy = SEMANTIC2D
+) -> Annotation:
+    """Read the annotation of a map image of a shape (height, width).
 
     Raises
     ------
@@ -91,16 +93,19 @@ def read_annotation(path: Path, shape: tuple[int, ...], taxonomy: Taxonomy = SEM
         As `annotate_map`.
     """
     if path.suffix.lower() == ".json":
-        regions = _rasterise(path, _read_labelme(path), shape, taxonomy)
+        shapes = read_shapes(path, shape, taxonomy)
+        regions = paint(shapes, shape)
     else:
-        regions = _read_label_image(path, shape, taxonomy)
-    return np.ascontiguousarray(regions[::-1])
+        shapes, regions = (), _read_label_image(path, shape, taxonomy)
+    return Annotation(np.ascontiguousarray(regions[::-1]), shapes)
 
 
 def label_cells(
     scene: SemanticMap, regions: Labels, taxonomy: Taxonomy = SEMANTIC2D
 ) -> SemanticMap:
     """Give the occupied cells of a map the class of the region that they lie in, or just beside.
+
+    All cells of a Person region are free afterwards, whatever the map has there.
 
     Parameters
     ----------
@@ -111,159 +116,115 @@ def label_cells(
     taxonomy
         Classes that the regions refer to.
     """
-    occupied = scene.occupancy == OCCUPIED
+    people = regions == taxonomy.id_of("Person")  # exactly those: beside them a wall goes on
+    occupied = (scene.occupancy == OCCUPIED) & ~people
     labels = np.where(occupied, regions, UNLABELLED).astype(np.uint8)
-    people = labels == taxonomy.id_of("Person")  # exactly those: beside them a wall goes on
-    objects = (labels != UNLABELLED) & ~people
+    objects = labels != UNLABELLED
     if objects.any():
         distance, indices = ndimage.distance_transform_edt(~objects, return_indices=True)
-        beside = occupied & ~people & (distance * scene.resolution <= MARGIN_M)
-        labels = np.where(beside, labels[tuple(indices)], labels)
+        beside = occupied & (distance * scene.resolution <= MARGIN_M)
+        labels = np.where(beside, labels[tuple(indices)], labels).astype(np.uint8)
     occupancy = np.where(people, FREE, scene.occupancy).astype(np.uint8)
-    labels = np.where(people, UNLABELLED, labels).astype(np.uint8)
     return replace(scene, occupancy=occupancy, labels=labels)
 
 
-def _read_labelme(path: Path) -> Mapping[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as err:
-        raise InvalidInputError(f"{path}: not a labelme JSON file: {err}") from err
-    if not isinstance(content, dict) or not isinstance(content.get("shapes"), list):
-        raise InvalidInputError(f"{path}: expected a labelme file with a list of `shapes`")
-    return content
-
-
-def _rasterise(
-    path: Path, content: Mapping[str, Any], shape: tuple[int, ...], taxonomy: Taxonomy
-) -> Labels:
-    """Draw the shapes in their order, the later ones on top, as labelme shows them."""
-    size = content.get("imageHeight"), content.get("imageWidth")
-    if not all(type(value) is int for value in size):
-        raise InvalidInputError(
-            f"{path}: expected imageHeight and imageWidth as whole numbers, found {size[0]!r} and "
-            f"{size[1]!r}; save it with labelme again"
-        )
-    _check_size(path, size, shape)
-    image = Image.new("L", (shape[1], shape[0]), UNLABELLED)
-    for number, item in enumerate(content["shapes"], start=1):
-        where = f"{path}: shape {number}"
-        try:
-            name, kind = item["label"], item.get("shape_type") or "polygon"
-            points = [(float(x), float(y)) for x, y in item["points"]]
-        except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as err:
-            raise InvalidInputError(
-                f"{where}: expected a label and points [[x, y], ...] ({err!r})"
-            ) from err
-        if not isinstance(kind, str) or kind not in _FEWEST_POINTS:
-            known = ", ".join(_FEWEST_POINTS)
-            raise InvalidInputError(f"{where}: unknown shape type {kind!r}; known are {known}")
-        if len(points) < _FEWEST_POINTS[kind] or not np.isfinite(points).all():
-            raise InvalidInputError(
-                f"{where}: a {kind} needs {_FEWEST_POINTS[kind]} or more finite points, "
-                f"found {points}"
-            )
-        _check_reach(where, kind, points, shape)
-        try:
-            label = taxonomy.id_of(str(name))
-        except InvalidInputError as err:
-            raise InvalidInputError(f"{where}: {err}") from err
-        _draw(image, where, kind, points, label, item)
-    return np.asarray(image)
-
-
-def _check_reach(
-    where: str, kind: str, points: list[tuple[float, float]], shape: tuple[int, ...]
+def check_labelled(
+    labelled: SemanticMap, map_yaml: Path, annotation: Path, taxonomy: Taxonomy = SEMANTIC2D
 ) -> None:
-    """Refuse what lies so far beyond the image that drawing it would overflow or take ages."""
-    limit = _MAX_DIAGONALS * math.hypot(*shape)
-    farthest = max(abs(value) for point in points for value in point)
-    if kind == "circle":
-        farthest = max(farthest, math.dist(points[0], points[1]))
-    if farthest > limit:
-        raise InvalidInputError(
-            f"{where}: expected coordinates and radii up to {limit:.0f} pixels, {_MAX_DIAGONALS} "
-            f"diagonals of the image, found {farthest:g}"
+    """Check that a map has objects of some class, which is what label transfer rests on.
+
+    Raises
+    ------
+    AlignmentError
+        If no cell is occupied, or none has a class other than the background.
+    """
+    if not (labelled.occupancy == OCCUPIED).any():
+        raise AlignmentError(
+            f"{map_yaml}: no cell is occupied, so there is nothing to label; check the thresholds "
+            f"and `negate` in it, and whether {annotation} calls everything a Person"
+        )
+    if np.isin(labelled.labels, (UNLABELLED, taxonomy.background_id)).all():
+        raise AlignmentError(
+            f"{annotation}: no occupied cell of {map_yaml} lies in a labelled shape, so there is "
+            f"nothing to transfer; is it the annotation of this map?"
         )
 
 
-def _draw(
-    image: Image.Image,
-    where: str,
-    kind: str,
-    points: list[tuple[float, float]],
-    label: int,
-    item: Mapping[str, Any],
-) -> None:
-    canvas = ImageDraw.Draw(image)
-    radius = _STROKE_PIXELS / 2
-    match kind:
-        case "polygon":
-            canvas.polygon(points, fill=label, outline=label)
-        case "rectangle":
-            xs, ys = zip(*points, strict=True)  # two opposite corners, or all four
-            canvas.rectangle((min(xs), min(ys), max(xs), max(ys)), fill=label)
-        case "circle":
-            (x, y), edge = points[0], points[1]
-            _dot(canvas, x, y, math.dist(points[0], edge), label)
-        case "line" | "linestrip":
-            canvas.line(points, fill=label, width=_STROKE_PIXELS)
-        case "mask":
-            x, y = points[0]
-            image.paste(label, (round(x), round(y)), _decode_mask(where, item))
-        case _:
-            for x, y in points:
-                _dot(canvas, x, y, radius, label)
+def write_label_image(path: Path, regions: Labels, taxonomy: Taxonomy = SEMANTIC2D) -> None:
+    """Write regions as a PNG palette image of class ids, which `read_annotation` reads back.
 
+    Pixels that nothing was said about are 255 and transparent, unlike the background class.
 
-def _dot(canvas: ImageDraw.ImageDraw, x: float, y: float, radius: float, label: int) -> None:
-    canvas.ellipse((x - radius, y - radius, x + radius, y + radius), fill=label)
+    Parameters
+    ----------
+    path
+        The file to write.
+    regions
+        (H, W) u1 class ids, 255 for none; row 0 is the smallest y.
+    taxonomy
+        Colours.
 
-
-def _decode_mask(where: str, item: Mapping[str, Any]) -> Image.Image:
-    """Return the bitmap that labelme stores with shapes of type mask."""
-    try:
-        data = base64.b64decode(item["mask"], validate=True)
-        with Image.open(io.BytesIO(data)) as mask:
-            return mask.convert("L").point(lambda value: 255 if value else 0)
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        OSError,
-        SyntaxError,
-        Image.DecompressionBombError,
-    ) as err:
-        raise InvalidInputError(f"{where}: its mask cannot be read ({err!r})") from err
+    Raises
+    ------
+    WriteError
+        If the folder does not exist.
+    """
+    palette = taxonomy.palette
+    palette[len(taxonomy) :] = _WHITE
+    image = Image.fromarray(np.ascontiguousarray(regions[::-1]))
+    image.putpalette(palette.tobytes())
+    content = io.BytesIO()
+    image.save(content, "PNG", transparency=UNLABELLED)
+    write_bytes_atomically(path, content.getvalue())
 
 
 def _read_label_image(path: Path, shape: tuple[int, ...], taxonomy: Taxonomy) -> Labels:
     """Read class ids from a grey or palette image, or class colours from any other.
 
-    The background class means that nobody labelled the pixel.
+    The background class means that nobody labelled the pixel, except in images whose id 255 is
+    transparent, as `write_label_image` writes them: there 255 means it.
     """
+    pixels, by_id, keeps_background = _load_image(path, shape)
+    if by_id:
+        _check_ids(path, pixels, taxonomy)
+    labels = pixels.astype(np.uint8) if by_id else _ids_of_colours(path, pixels, taxonomy)
+    if keeps_background:
+        return labels
+    return np.where(labels == taxonomy.background_id, UNLABELLED, labels).astype(np.uint8)
+
+
+def _load_image(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], bool, bool]:
+    """Pixels, whether they are ids, and whether 255 alone means that nothing was said."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: the annotation does not exist")
     try:
-        with Image.open(path) as image:
-            _check_size(path, (image.height, image.width), shape)
-            by_id = image.mode in ("1", "L", "P")
-            pixels = np.asarray(image if by_id else image.convert("RGB"))
-    except (OSError, SyntaxError, Image.DecompressionBombError) as err:
+        image = Image.open(path)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:
         raise InvalidInputError(f"{path}: neither labelme JSON nor an image: {err}") from err
-    labels = pixels.astype(np.uint8) if by_id else _ids_of_colours(path, pixels, taxonomy)
-    unknown = np.unique(labels[(labels >= len(taxonomy)) & (labels != UNLABELLED)])
+    with image:
+        check_size(path, (image.height, image.width), shape)
+        by_id = image.mode in _ID_MODES
+        marked = image.mode == "P" and image.info.get("transparency") == UNLABELLED
+        try:
+            return np.asarray(image if by_id else image.convert("RGB")), by_id, marked
+        except (OSError, SyntaxError, ValueError) as err:
+            raise InvalidInputError(f"{path}: not an image that can be read: {err}") from err
+
+
+def _check_ids(path: Path, pixels: NDArray[Any], taxonomy: Taxonomy) -> None:
+    found = np.unique(pixels)
+    unknown = found[((found < 0) | (found >= len(taxonomy))) & (found != UNLABELLED)]
     if len(unknown):
+        shown = ", ".join(map(str, unknown[:10].tolist())) + (", ..." if len(unknown) > 10 else "")
         raise InvalidInputError(
             f"{path}: expected class ids 0 to {len(taxonomy) - 1}, or {UNLABELLED} for none, "
-            f"found {unknown.tolist()}"
+            f"found {shown}; save class ids or class colours, not shades"
         )
-    return np.where(labels == taxonomy.background_id, UNLABELLED, labels).astype(np.uint8)
 
 
 def _ids_of_colours(path: Path, pixels: Labels, taxonomy: Taxonomy) -> Labels:
     labels = np.full(pixels.shape[:2], UNLABELLED, np.uint8)
-    known = (pixels == 255).all(axis=-1)  # white paper
+    known = (pixels == _WHITE).all(axis=-1)  # white paper
     for label, colour in enumerate(taxonomy.colours):
         same = (pixels == colour).all(axis=-1)
         labels[same], known = label, known | same
@@ -274,11 +235,3 @@ def _ids_of_colours(path: Path, pixels: Labels, taxonomy: Taxonomy) -> Labels:
             f"is no class; known are {dict(zip(taxonomy.names, taxonomy.colours, strict=True))}"
         )
     return labels
-
-
-def _check_size(path: Path, found: tuple[Any, Any], shape: tuple[int, ...]) -> None:
-    if found != tuple(shape):
-        raise InvalidInputError(
-            f"{path}: annotates an image of {found[1]} x {found[0]} pixels, but the map has "
-            f"{shape[1]} x {shape[0]}; annotate the image that the map's YAML file names"
-        )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from salsa.map_check import MapReport
     from salsa.sequences import Summary
 
 app = typer.Typer(
@@ -94,6 +95,128 @@ def label(
         from salsa.pictures import plot_labelled_sequence
 
         plot_labelled_sequence(out, plot)
+
+
+@app.command(name="map")
+def check_annotated_map(
+    map_yaml: Annotated[Path, typer.Argument(metavar="MAP", help="map_server YAML file.")],
+    annotation: Annotated[Path, typer.Argument(help="labelme JSON or label image of that map.")],
+    *,
+    plot: Annotated[
+        Path | None, typer.Option(help="Picture of the annotated map, to write.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Label image (.png) of the annotation, to write.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON for a program to read.")
+    ] = False,
+) -> None:
+    """Check the annotation of a map, draw it, or turn it into a label image.
+
+    What should be looked at is listed; only what `salsa label` would refuse is an error.
+    """
+    from salsa.annotation import check_labelled, label_cells, read_annotation, write_label_image
+    from salsa.map_check import check_map
+    from semantic2d_dataset.scene.maps import read_map
+
+    _check_map_targets(map_yaml, annotation, plot, out, force=force)
+    scene = read_map(map_yaml)
+    said = read_annotation(annotation, scene.occupancy.shape)
+    check_labelled(label_cells(scene, said.regions), map_yaml, annotation)
+    report = check_map(scene, said)
+    typer.echo(
+        json.dumps(asdict(report), indent=1)
+        if as_json
+        else _describe_map(report, map_yaml, annotation)
+    )
+    if out is not None:
+        write_label_image(out, said.regions)
+    if plot is not None:
+        from salsa.map_pictures import plot_annotated_map
+        from semantic2d_dataset.plotting import save
+
+        save(plot_annotated_map(scene, said, report), plot)
+
+
+@app.command(name="labelmerc")
+def write_labelmerc(
+    *,
+    out: Annotated[Path, typer.Option(help="File to write.")] = Path(".labelmerc"),
+    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+) -> None:
+    """Write settings for labelme: the classes, their colours, and no other names."""
+    from salsa.labelmerc import labelmerc
+    from salsa.sequences import check_target
+    from semantic2d_dataset.format.writing import write_text_atomically
+
+    check_target(out, (), force=force)
+    write_text_atomically(out, labelmerc())
+    typer.echo(f"{out}: written; annotate with: labelme --config {out} MAP_IMAGE")
+
+
+def _check_map_targets(
+    map_yaml: Path, annotation: Path, plot: Path | None, out: Path | None, *, force: bool
+) -> None:
+    """Refuse names that cannot be written before anything is read."""
+    from salsa.sequences import check_target
+    from semantic2d_dataset.errors import InvalidInputError
+    from semantic2d_dataset.plotting import check_picture_name
+    from semantic2d_dataset.scene.maps import map_image
+
+    inputs = (map_yaml, map_image(map_yaml), annotation)
+    if plot is not None:
+        check_picture_name(plot)
+        check_target(plot, inputs if out is None else (*inputs, out), force=force)
+    if out is not None:
+        if out.suffix.lower() != ".png":
+            raise InvalidInputError(f"{out}: a label image is a PNG file; end its name in .png")
+        check_target(out, inputs, force=force)
+
+
+def _describe_map(report: MapReport, map_yaml: Path, annotation: Path) -> str:
+    edge, area = report.resolution_m, report.resolution_m**2
+    metres = f"{report.width * edge:.1f} x {report.height * edge:.1f} m"
+    drawn = f"{len(report.shapes)} shapes" if report.shapes else "a label image"
+    lines = [
+        f"{map_yaml}: {report.width} x {report.height} pixels of {100 * edge:g} cm, {metres}",
+        *(
+            f"  {name:<11}{count:>10,}  {count * area:8.1f} m2"
+            for name, count in (
+                ("occupied", report.occupied),
+                ("free", report.free),
+                ("unknown", report.unknown),
+            )
+        ),
+        f"{annotation}: {drawn}",
+        "occupied cells by class:",
+        *_class_lines(report),
+        f"labelled pixels that are not occupied: {100 * report.not_occupied_share:.1f} %",
+    ]
+    if report.overlaps:
+        lines.append("occupied cells in shapes of two classes (the later shape has them):")
+        lines += [f"  {o.earlier} under {o.later}: {o.cells:,}" for o in report.overlaps]
+    lines.append("to look at:" if report.warnings else "nothing to look at")
+    lines += [f"  - {warning}" for warning in report.warnings]
+    if report.clusters:
+        lines.append(f"cells without a class, the largest of {report.cluster_count} groups:")
+        lines += [
+            f"  {c.cells:>7,} cells, {c.size_m:6.2f} m long, at pixel ({c.column}, {c.row}), "
+            f"x {c.x_m:.2f} y {c.y_m:.2f} m"
+            for c in report.clusters
+        ]
+    return "\n".join(lines)
+
+
+def _class_lines(report: MapReport) -> list[str]:
+    total = max(sum(report.classes.values()) + report.unlabelled, 1)
+    counts = report.classes | {"no class": report.unlabelled}
+    return [
+        f"  {name:<11}{count:>10,}  {100 * count / total:5.1f} %"
+        for name, count in counts.items()
+        if count or name == "no class"
+    ]
 
 
 def _describe(summary: Summary, out: Path) -> str:

@@ -17,7 +17,7 @@ CHAIR, WALL, PERSON = (SEMANTIC2D.id_of(name) for name in ("Chair", "Wall", "Per
 
 
 def drawn(tmp_path, *shapes):
-    return read_annotation(rooms.write_labelme(tmp_path / "a.json", list(shapes), SIZE), SIZE)
+    return read_annotation(rooms.write_labelme(tmp_path / "a.json", list(shapes), SIZE), SIZE).regions
 
 
 def test_annotating_the_room_gives_each_surface_its_class(tmp_path):
