@@ -27,6 +27,7 @@ Labels = NDArray[np.uint8]
 MARGIN_M = 0.1
 """An occupied cell this near to a labelled one takes its class: shapes often miss an edge."""
 
+_FORMATS = ("PNG", "BMP", "GIF", "PPM")  # those that keep every pixel as it was; PPM includes PGM
 _ID_MODES = ("1", "L", "P", "I", "I;16", "I;16B")
 _WHITE = (255, 255, 255)
 
@@ -198,9 +199,11 @@ def _load_image(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], bool,
     if not path.is_file():
         raise FileNotFoundError(f"{path}: the annotation does not exist")
     try:
-        image = Image.open(path)
+        image = Image.open(path, formats=_FORMATS)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:
-        raise InvalidInputError(f"{path}: neither labelme JSON nor an image: {err}") from err
+        raise InvalidInputError(
+            f"{path}: neither labelme JSON (.json) nor an image ({', '.join(_FORMATS)}): {err}"
+        ) from err
     with image:
         check_size(path, (image.height, image.width), shape)
         by_id = image.mode in _ID_MODES

@@ -168,11 +168,13 @@ def _check_map_targets(
     inputs = (map_yaml, map_image(map_yaml), annotation)
     if plot is not None:
         check_picture_name(plot)
-        check_target(plot, inputs if out is None else (*inputs, out), force=force)
+        check_target(plot, inputs, force=force)
     if out is not None:
         if out.suffix.lower() != ".png":
             raise InvalidInputError(f"{out}: a label image is a PNG file; end its name in .png")
         check_target(out, inputs, force=force)
+        if plot is not None and plot.resolve() == out.resolve():
+            raise InvalidInputError(f"{out}: cannot be both the picture and the label image")
 
 
 def _describe_map(report: MapReport, map_yaml: Path, annotation: Path) -> str:

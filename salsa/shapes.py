@@ -190,8 +190,8 @@ def _read_outline(where: str, item: Any, size: tuple[int, ...]) -> _Outline:
         raise InvalidInputError(f"{where}: unknown shape type {kind!r}; known are {known}")
     if len(points) < _FEWEST_POINTS[kind] or not np.isfinite(points).all():
         raise InvalidInputError(
-            f"{where}: a {kind} needs {_FEWEST_POINTS[kind]} or more finite points, "
-            f"found {[list(point) for point in points]}"
+            f"{where}: expected {_FEWEST_POINTS[kind]} or more finite points in a shape of type "
+            f"{kind}, found {[list(point) for point in points]}"
         )
     bitmap = _decode_bitmap(where, item) if kind == "mask" else None
     outline = _Outline(str(name), kind, points, bitmap)

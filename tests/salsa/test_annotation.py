@@ -1,23 +1,24 @@
-import base64
-import io
 import json
 
 import numpy as np
 import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from salsa.annotation import annotate_map, label_cells, read_annotation
+from salsa.annotation import annotate_map, label_cells, read_annotation, write_label_image
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError
-from semantic2d_dataset.scene.maps import FREE, OCCUPIED
+from semantic2d_dataset.scene.geometry import Pose2
+from semantic2d_dataset.scene.maps import FREE, OCCUPIED, write_map
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED
 from tests.salsa import rooms
 
 SIZE = (20, 30)
-CHAIR, WALL, PERSON = (SEMANTIC2D.id_of(name) for name in ("Chair", "Wall", "Person"))
-
-
-def drawn(tmp_path, *shapes):
-    return read_annotation(rooms.write_labelme(tmp_path / "a.json", list(shapes), SIZE), SIZE).regions
+OTHER, CHAIR, WALL, PERSON = (
+    SEMANTIC2D.id_of(name) for name in ("Other", "Chair", "Wall", "Person")
+)
 
 
 def test_annotating_the_room_gives_each_surface_its_class(tmp_path):
@@ -28,7 +29,9 @@ def test_annotating_the_room_gives_each_surface_its_class(tmp_path):
 
 
 def test_row_0_of_the_labels_is_the_bottom_of_the_picture(tmp_path):
-    labels = drawn(tmp_path, rooms.shape("Chair", [[0, 15], [9, 19]], "rectangle"))
+    item = rooms.shape("Chair", [[0, 15], [9, 19]], "rectangle")
+    path = rooms.write_labelme(tmp_path / "a.json", [item], SIZE)
+    labels = read_annotation(path, SIZE).regions
     assert (labels[:5, :10] == CHAIR).all()
     assert (labels[5:] == UNLABELLED).all()
 
@@ -42,46 +45,6 @@ def test_only_occupied_cells_take_a_class_and_those_just_beside_a_shape_too():
     bottom = labels[10]  # the wall that runs through row 10
     assert (bottom[10:102] == WALL).all()
     assert (bottom[102:] == UNLABELLED).all()
-
-
-def test_later_shapes_lie_on_top(tmp_path):
-    box = [[2, 2], [12, 2], [12, 12], [2, 12]]
-    labels = drawn(tmp_path, rooms.shape("Wall", box), rooms.shape("Chair", box[:3]))
-    assert set(np.unique(labels)) == {CHAIR, WALL, UNLABELLED}
-    assert labels[SIZE[0] - 1 - 4, 10] == CHAIR
-
-
-def bitmap():
-    data = io.BytesIO()
-    Image.fromarray(np.full((4, 6), 255, np.uint8)).save(data, "PNG")
-    return base64.b64encode(data.getvalue()).decode()
-
-
-@pytest.mark.parametrize(
-    ("shape_type", "points", "cells", "more"),
-    [
-        ("polygon", [[2, 2], [8, 2], [8, 8], [2, 8]], 49, {}),
-        ("rectangle", [[8, 8], [2, 2]], 49, {}),
-        ("rectangle", [[2, 2], [8, 2], [8, 8], [2, 8]], 49, {}),
-        ("circle", [[10, 10], [15, 10]], 81, {}),
-        ("line", [[2, 5], [20, 5]], 57, {}),
-        ("linestrip", [[2, 5], [20, 5], [20, 15]], 88, {}),
-        ("point", [[5, 5]], 9, {}),
-        ("points", [[5, 5], [15, 5]], 18, {}),
-        ("mask", [[3, 3], [8, 6]], 24, {"mask": bitmap()}),
-    ],
-)
-def test_every_shape_type_of_labelme_is_drawn(tmp_path, shape_type, points, cells, more):
-    labels = drawn(tmp_path, rooms.shape("chair", points, shape_type, **more))
-    assert (labels == CHAIR).sum() == pytest.approx(cells, rel=0.35)
-    assert set(np.unique(labels)) == {CHAIR, UNLABELLED}
-
-
-def test_names_are_matched_whatever_their_spelling_and_the_unknown_listed(tmp_path):
-    labels = drawn(tmp_path, rooms.shape("People", [[0, 0], [5, 5]], "rectangle"))
-    assert (labels == PERSON).any()
-    with pytest.raises(InvalidInputError, match=r"shape 1: unknown class 'Lamp'.*Chair, Door"):
-        drawn(tmp_path, rooms.shape("Lamp", [[0, 0], [5, 5]], "rectangle"))
 
 
 def test_a_mapped_person_is_free_space():
@@ -105,56 +68,8 @@ def test_a_label_image_of_ids_or_colours_is_the_same_annotation(tmp_path, mode):
         assert image.mode == "P"
     image.save(tmp_path / "label.png")
     np.testing.assert_array_equal(
-        read_annotation(tmp_path / "label.png", rooms.SHAPE), scene.labels
+        read_annotation(tmp_path / "label.png", rooms.SHAPE).regions, scene.labels
     )
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "not a labelme JSON"),
-        ("[]", "list of `shapes`"),
-        (
-            '{"shapes": [], "imageHeight": "20", "imageWidth": 30}',
-            "whole numbers, found '20' and 30",
-        ),
-        ('{"shapes": 3}', "list of `shapes`"),
-        ('{"shapes": [], "imageHeight": 20, "imageWidth": 31}', "31 x 20 pixels, but the map"),
-        ('{"shapes": []}', "whole numbers, found None and None"),
-        ('{"shapes": [3], "imageHeight": 20, "imageWidth": 30}', "shape 1: expected a label"),
-        ('{"shapes": [{"label": "Wall"}], "imageHeight": 20, "imageWidth": 30}', "points"),
-    ],
-)
-def test_a_malformed_annotation_says_what_is_wrong(tmp_path, content, message):
-    path = tmp_path / "a.json"
-    path.write_text(content, encoding="utf-8")
-    with pytest.raises(InvalidInputError, match=message):
-        read_annotation(path, SIZE)
-
-
-@pytest.mark.parametrize(
-    ("points", "shape_type", "message"),
-    [
-        ([[0, 0], [1, 1]], "polygon", "a polygon needs 3"),
-        ([[0, 0], [1, float("nan")], [2, 2]], "polygon", "finite points"),
-        ([[0, 0], [1, 1]], "spline", "unknown shape type 'spline'"),
-        ([[0, 0, 0]], "point", "points"),
-        ([[0, 0], [4, 4]], "mask", "mask cannot be read"),
-        ([[0, 0], [1, 1]], ["polygon"], "unknown shape type"),
-        ([[0, 10**400], [1, 1]], "line", "shape 1: expected a label and points"),
-        ([[0, 0], [1e30, 1]], "line", "up to 361 pixels, 10 diagonals of the image, found 1e.30"),
-        ([[-360, 0], [360, 0]], "circle", "radii up to 361 pixels.*found 720"),
-    ],
-)
-def test_a_malformed_shape_says_what_is_wrong(tmp_path, points, shape_type, message):
-    with pytest.raises(InvalidInputError, match=message):
-        drawn(tmp_path, rooms.shape("Wall", points, shape_type))
-
-
-def test_a_mask_of_other_letters_than_ascii_is_an_error(tmp_path):
-    item = rooms.shape("Wall", [[0, 0], [4, 4]], "mask", mask="\u00e9")
-    with pytest.raises(InvalidInputError, match="shape 1: its mask cannot be read"):
-        drawn(tmp_path, item)
 
 
 def test_a_person_before_a_wall_takes_only_the_cells_in_its_own_shape():
@@ -175,12 +90,12 @@ def test_a_label_image_that_does_not_fit_is_an_error(tmp_path):
 
     with pytest.raises(InvalidInputError, match="40 x 20 pixels, but the map has 30 x 20"):
         read_annotation(saved(np.zeros((20, 40), np.uint8)), SIZE)
-    with pytest.raises(InvalidInputError, match=r"class ids 0 to 9.*found \[17\]"):
+    with pytest.raises(InvalidInputError, match=r"class ids 0 to 9.*found 17"):
         read_annotation(saved(np.full(SIZE, 17, np.uint8)), SIZE)
     with pytest.raises(InvalidInputError, match=r"colour \(1, 2, 3\) at column 0, row 0"):
         read_annotation(saved(np.full((*SIZE, 3), (1, 2, 3), np.uint8)), SIZE)
     (tmp_path / "label.png").write_bytes(b"no image")
-    with pytest.raises(InvalidInputError, match="neither labelme JSON nor an image"):
+    with pytest.raises(InvalidInputError, match="neither labelme JSON .* nor an image"):
         read_annotation(tmp_path / "label.png", SIZE)
     with pytest.raises(FileNotFoundError, match="none.png"):
         read_annotation(tmp_path / "none.png", SIZE)
@@ -195,3 +110,111 @@ def test_an_annotation_that_meets_no_occupied_cell_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         annotate_map(tmp_path / "none.yaml", annotation)
     assert json.loads(annotation.read_text())["shapes"]
+
+
+def test_every_cell_of_a_person_region_is_free_whatever_the_map_has_there():
+    scene = rooms.room_map()
+    regions = np.full_like(scene.labels, UNLABELLED)
+    regions[:30, :30] = PERSON  # unknown space, walls and free space
+    found = label_cells(scene, regions)
+    assert {0, 100, 255} == set(np.unique(scene.occupancy[:30, :30]))
+    assert (found.occupancy[:30, :30] == FREE).all()
+    np.testing.assert_array_equal(found.occupancy[30:], scene.occupancy[30:])
+
+
+def test_a_map_with_nothing_but_other_has_nothing_to_transfer(tmp_path):
+    map_yaml, annotation = rooms.write_room(tmp_path)
+    rooms.write_labelme(annotation, [rooms.shape("Other", [[0, 0], [179, 139]], "rectangle")])
+    with pytest.raises(AlignmentError, match="no occupied cell of .*room.yaml lies in a labelled"):
+        annotate_map(map_yaml, annotation)
+
+
+def test_a_map_without_an_occupied_cell_is_told_to_check_its_settings(tmp_path):
+    map_yaml, annotation = rooms.write_room(tmp_path)
+    Image.fromarray(np.full(rooms.SHAPE, 254, np.uint8)).save(tmp_path / "room.pgm")
+    with pytest.raises(AlignmentError, match=r"room.yaml: no cell is occupied.*negate"):
+        annotate_map(map_yaml, annotation)
+
+
+@given(
+    regions=arrays(
+        np.uint8,
+        st.tuples(st.integers(1, 12), st.integers(1, 12)),
+        elements=st.sampled_from([*range(len(SEMANTIC2D)), UNLABELLED]),
+    )
+)
+def test_a_written_label_image_reads_back_the_same(tmp_path_factory, regions):
+    path = tmp_path_factory.getbasetemp() / "labels.png"
+    write_label_image(path, regions)
+    found = read_annotation(path, regions.shape)
+    np.testing.assert_array_equal(found.regions, regions)
+    assert found.shapes == ()
+
+
+def test_a_written_label_image_shows_the_classes_in_their_colours(tmp_path):
+    write_label_image(tmp_path / "a.png", np.array([[WALL, UNLABELLED], [OTHER, CHAIR]], np.uint8))
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.mode == "P"
+        rgba = np.asarray(image.convert("RGBA"))
+    wanted = [[[*SEMANTIC2D.colours[i], 255] for i in (OTHER, CHAIR)]]  # the largest y is on top
+    assert rgba[:1].tolist() == wanted
+    assert rgba[1].tolist() == [[*SEMANTIC2D.colours[WALL], 255], [255, 255, 255, 0]]
+
+
+def test_ids_of_more_than_a_byte_are_not_cut_off(tmp_path):
+    Image.fromarray(np.full(SIZE, 256 + CHAIR, np.uint16)).save(tmp_path / "a.png")
+    with pytest.raises(InvalidInputError, match="found 257"):
+        read_annotation(tmp_path / "a.png", SIZE)
+    Image.fromarray(np.full(SIZE, CHAIR, np.uint16)).save(tmp_path / "a.png")
+    assert (read_annotation(tmp_path / "a.png", SIZE).regions == CHAIR).all()
+
+
+def test_a_truncated_label_image_is_refused(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 10, SIZE).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    whole = (tmp_path / "a.png").read_bytes()
+    for length in (0, 20, 60, len(whole) // 2):
+        (tmp_path / "a.png").write_bytes(whole[:length])
+        with pytest.raises(InvalidInputError, match="image"):
+            read_annotation(tmp_path / "a.png", SIZE)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
+def test_the_origin_of_the_map_turns_with_its_labels(yaw, tmp_path):
+    origin = Pose2(2.0, -1.0, yaw)
+    write_map(tmp_path / "room.yaml", rooms.room_map(origin))
+    annotation = rooms.write_labelme(tmp_path / "room.json", rooms.room_shapes())
+    scene = annotate_map(tmp_path / "room.yaml", annotation)
+    x, y = 3.025, 2.3  # on the left side of the pillar, from the corner of the grid
+    c, s = np.cos(yaw), np.sin(yaw)
+    row, column = scene.cells_of((2.0 + c * x - s * y, -1.0 + s * x + c * y))
+    assert scene.labels[row, column] == SEMANTIC2D.id_of("Pillar")
+
+
+@pytest.mark.parametrize(
+    ("settings", "levels"),
+    [({"negate": 1}, (255, 0)), ({"mode": "raw"}, (100, 0)), ({"mode": "scale"}, (0, 255))],
+)
+def test_maps_of_every_mode_can_be_annotated(settings, levels, tmp_path):
+    map_yaml, annotation = rooms.write_room(tmp_path)
+    occupied = rooms.room_map().occupancy == OCCUPIED
+    image = np.where(occupied, *levels).astype(np.uint8)[::-1]
+    Image.fromarray(np.ascontiguousarray(image)).save(tmp_path / "room.pgm")
+    said = yaml.safe_load(map_yaml.read_text()) | settings
+    map_yaml.write_text(yaml.safe_dump(said))
+    scene = annotate_map(map_yaml, annotation)
+    np.testing.assert_array_equal(scene.labels != UNLABELLED, occupied)
+
+
+def test_the_published_map_and_its_label_image_are_read(shared_data):
+    folder = shared_data / "temple_lobby"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not present")
+    scene = annotate_map(folder / "map.yaml", folder / "label.png")
+    occupied = scene.occupancy == OCCUPIED
+    assert occupied.sum() == 19854
+    assert (scene.labels[occupied] != UNLABELLED).mean() > 0.999
+    said = read_annotation(folder / "label.png", scene.occupancy.shape)
+    people = said.regions == PERSON
+    assert people.sum() == 4536
+    assert (scene.occupancy[people] == FREE).all()

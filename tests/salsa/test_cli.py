@@ -5,7 +5,9 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from salsa.annotation import annotate_map
 from salsa.cli import app
+from salsa.labelmerc import labelmerc
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.sequence import SequenceReader
 from tests.salsa import rooms
@@ -90,3 +92,99 @@ def test_the_summary_is_printed_even_where_the_picture_fails(words, tmp_path, mo
     result = CliRunner().invoke(app, [*words, f"--plot={tmp_path / 'a.png'}"])
     assert str(result.exception) == "disk full"
     assert "6 accepted" in result.output
+
+
+@pytest.fixture
+def room(tmp_path):
+    """The words that check a map, and the folder that it lies in."""
+    map_yaml, annotation = rooms.write_room(tmp_path)
+    return ["map", str(map_yaml), str(annotation)]
+
+
+def test_map_says_what_the_annotation_holds_and_what_to_look_at(room, tmp_path):
+    shapes = [shape for shape in rooms.room_shapes() if shape["label"] != "Wall"]
+    rooms.write_labelme(tmp_path / "room.json", shapes)
+    result = CliRunner().invoke(app, room)
+    assert result.exit_code == 0, result.output
+    for said in (
+        "180 x 140 pixels of 5 cm, 9.0 x 7.0 m",
+        "3 shapes",
+        "Pillar",
+        "no class",
+        "become Other",
+        "m long, at pixel (",
+    ):
+        assert said in result.output
+
+
+def test_map_says_when_there_is_nothing_to_look_at(room):
+    assert "nothing to look at" in CliRunner().invoke(app, room).output
+
+
+def test_map_prints_json_for_a_program(room):
+    found = json.loads(CliRunner().invoke(app, [*room, "--json"]).stdout)
+    assert found["unlabelled"] == 0
+    assert found["warnings"] == []
+    assert [shape["name"] for shape in found["shapes"]] == ["Wall", "Pillar", "Table", "Sofa"]
+
+
+def test_the_label_image_that_map_writes_is_the_same_annotation(room, tmp_path):
+    image = tmp_path / "labels.png"
+    result = CliRunner().invoke(app, [*room, f"--out={image}", f"--plot={tmp_path / 'map.png'}"])
+    assert result.exit_code == 0, result.output
+    from_json, from_image = (annotate_map(tmp_path / "room.yaml", p) for p in (room[2], image))
+    np.testing.assert_array_equal(from_image.labels, from_json.labels)
+    assert CliRunner().invoke(app, ["map", room[1], str(image)]).exit_code == 0
+    with Image.open(tmp_path / "map.png") as picture:
+        assert min(picture.size) > 300
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--out=labels.jpg", "end its name in .png"),
+        ("--out=none/labels.png", "does not exist"),
+        ("--plot=map.txt", "ends in one of"),
+        ("--plot=none/map.png", "does not exist"),
+        ("--out=old.png", "exists already"),
+        ("--plot=old.png", "exists already"),
+    ],
+)
+def test_map_refuses_names_that_cannot_be_written(room, option, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old.png").write_bytes(b"kept")
+    before = sorted(tmp_path.iterdir())
+    result = CliRunner().invoke(app, [*room, option])
+    assert result.exit_code == 1
+    assert message in str(result.exception)
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "old.png").read_bytes() == b"kept"
+
+
+def test_map_writes_neither_over_an_input_nor_two_things_into_one_file(room, tmp_path):
+    image = tmp_path / "labels.png"
+    assert CliRunner().invoke(app, [*room, f"--out={image}"]).exit_code == 0
+    for words in (["map", room[1], str(image), "--force"], [*room, f"--plot={image}", "--force"]):
+        result = CliRunner().invoke(app, [*words, f"--out={image}"])
+        assert isinstance(result.exception, InvalidInputError)
+    assert CliRunner().invoke(app, [*room, f"--out={image}", "--force"]).exit_code == 0
+
+
+def test_map_of_another_size_is_an_error_and_nothing_is_written(room, tmp_path):
+    rooms.write_labelme(tmp_path / "room.json", rooms.room_shapes(), (140, 181))
+    result = CliRunner().invoke(app, [*room, f"--out={tmp_path / 'labels.png'}"])
+    assert "181 x 140 pixels, but the map has 180 x 140" in str(result.exception)
+    assert not (tmp_path / "labels.png").exists()
+
+
+def test_labelmerc_is_written_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["labelmerc"])
+    assert result.exit_code == 0, result.output
+    assert "labelme --config .labelmerc" in result.output
+    assert (tmp_path / ".labelmerc").read_text() == labelmerc()
+    (tmp_path / ".labelmerc").write_text("mine")
+    assert isinstance(CliRunner().invoke(app, ["labelmerc"]).exception, InvalidInputError)
+    assert (tmp_path / ".labelmerc").read_text() == "mine"
+    assert CliRunner().invoke(app, ["labelmerc", "--force"]).exit_code == 0
+    assert (tmp_path / ".labelmerc").read_text() == labelmerc()
