@@ -202,9 +202,9 @@ def _describe_map(report: MapReport, map_yaml: Path, annotation: Path) -> str:
     lines.append("to look at:" if report.warnings else "nothing to look at")
     lines += [f"  - {warning}" for warning in report.warnings]
     if report.clusters:
-        lines.append(f"cells without a class, the largest of {report.cluster_count} groups:")
+        lines.append(f"groups of cells without a class ({report.cluster_count}), largest first:")
         lines += [
-            f"  {c.cells:>7,} cells, {c.size_m:6.2f} m long, at pixel ({c.column}, {c.row}), "
+            f"  {c.cells:>7,} cell(s), {c.size_m:6.2f} m long, at pixel ({c.column}, {c.row}), "
             f"x {c.x_m:.2f} y {c.y_m:.2f} m"
             for c in report.clusters
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -50,12 +51,10 @@ def plot_annotated_map(
     figure = Figure(layout="constrained")
     FigureCanvasAgg(figure)
     ax = figure.subplots()
-    labelled = label_cells(scene, annotation.regions, taxonomy)
-    plotting.plot_map(labelled, ax=ax, taxonomy=taxonomy)
-    person = taxonomy.id_of("Person")
-    _dots(ax, scene, annotation.regions == person, taxonomy.colours[person], size=1)
-    forgotten = (labelled.occupancy == OCCUPIED) & (labelled.labels == UNLABELLED)
-    _dots(ax, scene, forgotten, FORGOTTEN_RGB, size=9)
+    shown, forgotten = _as_shown(scene, annotation, taxonomy)
+    plotting.plot_map(shown, ax=ax, taxonomy=_with_forgotten(taxonomy))
+    x, y = scene.centres_of(np.argwhere(forgotten)).T  # seen however small a cell is
+    ax.scatter(x, y, s=9, marker="s", color=_colour(FORGOTTEN_RGB), linewidths=0, zorder=3)
     for shape in annotation.shapes:
         _draw_outline(ax, scene, shape, taxonomy)
     _fit_to_map(figure, ax)
@@ -65,12 +64,23 @@ def plot_annotated_map(
     return figure
 
 
-def _dots(
-    ax: Axes, scene: SemanticMap, cells: NDArray[np.bool_], rgb: tuple[int, int, int], *, size: int
-) -> None:
-    """Mark cells by dots that can be seen however small a cell is."""
-    x, y = scene.centres_of(np.argwhere(cells)).T
-    ax.scatter(x, y, s=size, marker="s", color=_colour(rgb), linewidths=0, zorder=3)
+def _as_shown(
+    scene: SemanticMap, annotation: Annotation, taxonomy: Taxonomy
+) -> tuple[SemanticMap, NDArray[np.bool_]]:
+    """Return the map with cells of people and forgotten cells as if of a class, and the latter."""
+    labelled = label_cells(scene, annotation.regions, taxonomy)
+    forgotten = (labelled.occupancy == OCCUPIED) & (labelled.labels == UNLABELLED)
+    person = taxonomy.id_of("Person")
+    people = annotation.regions == person
+    labels, occupancy = labelled.labels.copy(), labelled.occupancy.copy()
+    labels[forgotten] = len(taxonomy)
+    labels[people], occupancy[people] = person, OCCUPIED
+    shown = replace(scene, occupancy=occupancy, labels=labels)
+    return shown, forgotten
+
+
+def _with_forgotten(taxonomy: Taxonomy) -> Taxonomy:
+    return Taxonomy((*taxonomy.names, "(no class)"), (*taxonomy.colours, FORGOTTEN_RGB))
 
 
 def _draw_outline(ax: Axes, scene: SemanticMap, shape: Shape, taxonomy: Taxonomy) -> None:
