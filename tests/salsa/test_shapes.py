@@ -36,11 +36,14 @@ def drawn(folder, *items):
     return paint(read_shapes(rooms.write_labelme(folder / "a.json", list(items), SIZE), SIZE), SIZE)
 
 
-def test_later_shapes_lie_on_top(tmp_path):
+@pytest.mark.parametrize("names", [("Wall", "Chair"), ("Chair", "Wall")])
+def test_later_shapes_lie_on_top(tmp_path, names):
     box = [[2, 2], [12, 2], [12, 12], [2, 12]]
-    labels = drawn(tmp_path, rooms.shape("Wall", box), rooms.shape("Chair", box[:3]))
+    earlier, later = names
+    labels = drawn(tmp_path, rooms.shape(earlier, box), rooms.shape(later, box[:3]))
     assert set(np.unique(labels)) == {CHAIR, WALL, UNLABELLED}
-    assert labels[4, 10] == CHAIR
+    assert labels[4, 10] == SEMANTIC2D.id_of(later)
+    assert labels[10, 4] == SEMANTIC2D.id_of(earlier)
 
 
 def bitmap():
@@ -107,11 +110,38 @@ def test_what_else_labelme_writes_makes_no_difference(tmp_path):
     np.testing.assert_array_equal(paint(read_shapes(tmp_path / "b.json", SIZE), SIZE), plain)
 
 
-def test_a_shape_is_drawn_the_same_wherever_its_box_begins(tmp_path):
-    corners = [[-3.5, -2.2], [12.6, 1.4], [40.1, 25.7], [4.4, 17.5]]
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [[-3.5, -2.2], [12.6, 1.4], [40.1, 25.7], [4.4, 17.5]],
+        [[11.5, 7.2], [22.6, 9.4], [14.4, 15.5]],
+        [[25, 15], [29.9, 15], [29.9, 19.9]],
+    ],
+)
+def test_a_polygon_is_drawn_as_on_the_whole_image(tmp_path, corners):
     image = Image.new("L", SIZE[::-1], UNLABELLED)
     ImageDraw.Draw(image).polygon([tuple(p) for p in corners], fill=WALL, outline=WALL)
     np.testing.assert_array_equal(drawn(tmp_path, rooms.shape("Wall", corners)), np.asarray(image))
+
+
+@pytest.mark.parametrize("place", [(12, 7), (-2, -1), (27, 18)])
+def test_a_bitmap_lies_where_its_corner_does(tmp_path, place):
+    x, y = place
+    item = rooms.shape("Wall", [[x, y], [x + 5, y + 3]], "mask", mask=bitmap())
+    wanted = np.full(SIZE, UNLABELLED, np.uint8)
+    wanted[max(y, 0) : y + 4, max(x, 0) : x + 6] = WALL
+    np.testing.assert_array_equal(drawn(tmp_path, item), wanted)
+
+
+def test_strokes_are_three_pixels_wide_on_both_sides_of_a_line(tmp_path):
+    upright = drawn(tmp_path, rooms.shape("Wall", [[12, 4], [12, 14]], "line"))
+    wanted = np.full(SIZE, UNLABELLED, np.uint8)
+    wanted[4:15, 11:14] = WALL
+    np.testing.assert_array_equal(upright, wanted)
+    flat = drawn(tmp_path, rooms.shape("Wall", [[4, 12], [14, 12]], "line"))
+    wanted = np.full(SIZE, UNLABELLED, np.uint8)
+    wanted[11:14, 4:15] = WALL
+    np.testing.assert_array_equal(flat, wanted)
 
 
 def test_a_shape_beside_the_image_covers_nothing(tmp_path):
