@@ -175,28 +175,8 @@ def group_furniture(world: World, image: np.ndarray) -> World:
     return replace(world, primitives=replace(solid, objects=objects))
 
 
-def change(place: Place, seed: int) -> World:
-    """Change a world behind the back of its map; walls of short edges are bent instead."""
-    changed = perturb(place.world, seed)
-    return changed if place.label_image is None else bend_walls(changed, seed)
-
-
-def bend_walls(world: World, seed: int, size: float = 0.04, length: float = 6.0) -> World:
-    """Displace walls by `size` m, in a direction that turns over some `length` m."""
-    rng = np.random.default_rng((seed, 11))
-    solid = world.primitives
-    segments = solid.segments.copy()
-    walls = solid.labels[: len(segments)] == WALL
-    ends = segments[walls].reshape(-1, 2)
-    waves = rng.normal(size=(2, 3)) * 2 * np.pi / length / np.sqrt(2)
-    way = np.pi * np.sin(ends @ waves + rng.uniform(0, 2 * np.pi, 3)).sum(axis=-1)
-    ends = ends + size * np.stack((np.cos(way), np.sin(way)), axis=-1)
-    segments[walls] = ends.reshape(-1, 4)
-    return replace(world, primitives=replace(solid, segments=segments))
-
-
 def record(place: Place, kind: str, seed: int, scans: int) -> SimulatedRecording:
-    world = place.world if kind == WORLDS[0] else change(place, seed)
+    world = place.world if kind == WORLDS[0] else perturb(place.world, seed)
     return simulate_recording(world, find_lidar("hokuyo"), seed=seed, scans=scans)
 
 

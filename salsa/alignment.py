@@ -134,9 +134,22 @@ def align(
     grid = field.origin.as_array()
     starts = compose(invert(grid), batch.poses)  # NaN stays NaN
     poses = _register(beams_of(batch, use), starts, _in_grid(before, grid), field)
-    found = measure(batch, compose(grid, poses), field, acceptance=acceptance)
-    near = corrections(batch.poses, found.poses) <= acceptance.max_correction_m
-    return replace(found, accepted=found.accepted & near & _inside(poses, field))
+    return judge(batch, compose(grid, poses), field, acceptance=acceptance)
+
+
+def judge(
+    batch: ScanBatch,
+    poses: Float,
+    scene: SemanticMap | MapField,
+    *,
+    acceptance: Acceptance = TRUSTED,
+) -> Alignment:
+    """Measure how scans fit at refined poses (N, 3); none far from its rough one is accepted."""
+    field = as_field(scene)
+    found = measure(batch, poses, field, acceptance=acceptance)
+    near = corrections(batch.poses, poses) <= acceptance.max_correction_m
+    inside = _inside(compose(invert(field.origin.as_array()), poses), field)
+    return replace(found, accepted=found.accepted & near & inside)
 
 
 def measure(

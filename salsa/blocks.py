@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from salsa.alignment import Alignment, align, fit
+from salsa.alignment import Alignment, align, fit, judge
 from salsa.annotation import annotate_map
 from salsa.evidence import Evidence, gather
 from salsa.fields import MapField, map_field
@@ -95,6 +95,14 @@ def align_block(job: Job, block: Block) -> tuple[Alignment, NDArray[np.float32]]
     batch = rough_batch(prepared.reader, block)
     found = align(batch, prepared.field, acceptance=acceptance, before=block.before)
     return found, fit(batch, batch.poses, prepared.field, acceptance.inlier_m)[1]
+
+
+def judge_block(job: Job, block: Block) -> Alignment:
+    """Say how scans fit at the poses that they have been given."""
+    prepared = prepare(job)
+    batch = rough_batch(prepared.reader, block)
+    poses, acceptance = aligned(block).poses, job.settings.acceptance
+    return judge(batch, poses, prepared.field, acceptance=acceptance)
 
 
 def gather_block(job: Job, block: Block) -> Evidence:

@@ -47,6 +47,12 @@ def label(
             "for a thing and not a person; 0 calls all of it Person.",
         ),
     ] = 5,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Let poses agree with the motion from scan to scan.")
+    ] = False,
+    odometry: Annotated[
+        str, typer.Option(help="Stream of the sequence that tells this motion; implies --smooth.")
+    ] = "",
     ignore_no_return: Annotated[
         bool,
         typer.Option(
@@ -67,6 +73,7 @@ def label(
     from salsa.labelling import Transfer
     from salsa.sequences import check_target, input_files, label_sequence
     from salsa.settings import Settings
+    from salsa.smoothing import Smoothing
     from salsa.things import Persistence
     from semantic2d_dataset.executors import open_executor
 
@@ -77,6 +84,7 @@ def label(
         inputs = input_files(sequence, map_yaml, annotation).values()
         check_target(plot, (*inputs, out), force=force)
     settings = Settings(
+        smoothing=Smoothing(odometry=odometry) if smooth or odometry else None,
         persistence=Persistence(min_seconds=static_after) if static_after else None,
         transfer=Transfer(ignore_no_return=ignore_no_return),
     )

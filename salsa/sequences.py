@@ -26,6 +26,7 @@ from salsa.blocks import (
     blocks_of,
     gather_block,
     joined,
+    judge_block,
     label_block,
     prepare,
     rough_poses,
@@ -33,6 +34,7 @@ from salsa.blocks import (
 )
 from salsa.evidence import Ledger, coarse
 from salsa.settings import Settings
+from salsa.smoothing import read_odometry, smooth
 from salsa.things import NO_THINGS, Things, find_things
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
 from semantic2d_dataset.executors import Executor, Serial
@@ -136,6 +138,7 @@ def label_sequence(
         header = replace(reader.header, provenance=provenance)
         with tqdm(total=2 * len(reader), desc=source.name, unit="scan", disable=None) as bar:
             found, near_before = _align_all(job, run, bar)
+            found = _smoothed(job, found, run)
             _check_fit(source, found, corrections(rough_poses(reader, 0, len(reader)), found.poses))
             things = _find_things(job, found, run)
             with SequenceWriter(out, header) as writer:
@@ -244,6 +247,18 @@ def _help_on(job: Job, blocks: list[Block], parts: list[Alignment], run: Executo
         if found.accepted.sum() > parts[number].accepted.sum():
             parts[number] = found
     return joined(parts)
+
+
+def _smoothed(job: Job, found: Alignment, run: Executor) -> Alignment:
+    """Let the poses of the whole recording agree with each other, where that is asked for."""
+    smoothing, reader = job.settings.smoothing, prepare(job).reader
+    if smoothing is None:
+        return found
+    odometry = read_odometry(reader, smoothing.odometry) if smoothing.odometry else None
+    rough, stamps_ns = rough_poses(reader, 0, len(reader)), reader.read("scans/stamps_ns")
+    poses = smooth(found, rough, stamps_ns, smoothing, odometry=odometry)
+    blocks = _with_alignment(job, replace(found, poses=poses))
+    return joined(list(run.map(partial(judge_block, job), blocks)))
 
 
 def _find_things(job: Job, found: Alignment, run: Executor) -> Things:

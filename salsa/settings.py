@@ -9,6 +9,7 @@ from typing import Any
 
 from salsa.alignment import TRUSTED, Acceptance
 from salsa.labelling import DEFAULT_TRANSFER, Transfer
+from salsa.smoothing import Smoothing
 from salsa.things import DEFAULT_PERSISTENCE, Persistence
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.lines import PUBLISHED, LineParameters
@@ -16,10 +17,15 @@ from semantic2d_dataset.scene.lines import PUBLISHED, LineParameters
 
 @dataclass(frozen=True)
 class Settings:
-    """Parameters of all steps; None leaves `persistence` out: what stays is called Person then."""
+    """Parameters of all steps.
+
+    `smoothing` is left out where it is None; so is `persistence`, and what stays in free space is
+    called Person then.
+    """
 
     lines: LineParameters = PUBLISHED
     acceptance: Acceptance = TRUSTED
+    smoothing: Smoothing | None = None
     persistence: Persistence | None = DEFAULT_PERSISTENCE
     transfer: Transfer = DEFAULT_TRANSFER
 
@@ -27,6 +33,7 @@ class Settings:
 _STEPS: dict[str, type] = {
     "lines": LineParameters,
     "acceptance": Acceptance,
+    "smoothing": Smoothing,
     "persistence": Persistence,
     "transfer": Transfer,
 }
@@ -39,7 +46,8 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
     ----------
     values
         By step, then by parameter: ``{"persistence": {"min_seconds": 10}}``; what is not named
-        keeps its default, and ``{"persistence": None}`` leaves that step out.
+        keeps its default; ``{"persistence": None}`` leaves that step out, ``{"smoothing": {}}``
+        takes one in.
 
     Raises
     ------
@@ -52,7 +60,7 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
 def _step(name: str, values: Any) -> Any:
     if name not in _STEPS:
         raise InvalidInputError(f"salsa: {_unknown(name, list(_STEPS))}")
-    if values is None and name == "persistence":
+    if values is None and name in ("smoothing", "persistence"):
         return None
     kind = _STEPS[name]
     if not isinstance(values, Mapping):
