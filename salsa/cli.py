@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="salsa",
-    help="Label sequences from one annotated map.",
+    help="Label sequences from one annotated map, and review what came of it.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -25,7 +25,7 @@ app = typer.Typer(
 
 @app.callback()
 def commands() -> None:
-    """Label sequences from one annotated map."""
+    """Label sequences from one annotated map, and review what came of it."""
 
 
 @app.command()
@@ -227,6 +227,40 @@ def _class_lines(report: MapReport) -> list[str]:
         for name, count in counts.items()
         if count or name == "no class"
     ]
+
+
+@app.command()
+def review(
+    sequence: Annotated[Path, typer.Argument(help="Labelled sequence (.h5).")],
+    *,
+    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("review.html"),
+    drop: Annotated[
+        Path | None,
+        typer.Option(help="Scans to drop: an index or start-stop a line, as the page saves it."),
+    ] = None,
+    cleaned: Annotated[
+        Path | None, typer.Option(help="Copy without these scans to write; the page is of it.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+) -> None:
+    """Write a page to judge labels by; drop the scans that were found wrong."""
+    from salsa.dropping import drop_scans, read_drop_list
+    from salsa.review import write_review
+    from salsa.sequences import check_target
+    from semantic2d_dataset.format.sequence import SequenceReader
+
+    if (drop is None) != (cleaned is None):
+        raise typer.BadParameter("--drop and --cleaned belong together: which scans, and where to")
+    inputs = [path for path in (sequence, drop, cleaned) if path is not None]
+    check_target(out, inputs, force=force)  # before minutes of work
+    if drop is not None and cleaned is not None:
+        check_target(cleaned, (sequence, drop), force=force)
+        with SequenceReader(sequence) as reader:
+            scans = read_drop_list(drop, len(reader))
+        drop_scans(sequence, scans, cleaned, force=force)
+        typer.echo(f"wrote {cleaned}: {len(scans)} scans dropped")
+    write_review(out, cleaned or sequence)
+    typer.echo(f"wrote {out}")
 
 
 def _describe(summary: Summary, out: Path) -> str:
