@@ -84,6 +84,52 @@ def test_an_input_is_no_picture_and_a_picture_is_replaced_only_by_force(words, t
     assert not (tmp_path / "out.h5").exists()
 
 
+def review(*words):
+    return CliRunner().invoke(app, ["review", *map(str, words)])
+
+
+def test_review_writes_a_page_and_replaces_one_only_by_force(labelled_room, tmp_path):
+    page = tmp_path / "page.html"
+    result = review(labelled_room, "--out", page)
+    assert result.exit_code == 0, result.output
+    assert f"wrote {page}" in result.output
+    page.write_text("mine")
+    assert "exists already" in str(review(labelled_room, "--out", page).exception)
+    assert page.read_text() == "mine"
+    assert review(labelled_room, "--out", page, "--force").exit_code == 0
+    assert "Review of labelled.h5" in page.read_text()
+
+
+def test_review_drops_scans_into_a_cleaned_copy_and_shows_that(labelled_room, tmp_path):
+    (tmp_path / "scans.txt").write_text("# blurred\n3\n10-12\n")
+    words = ("--out", tmp_path / "page.html", "--drop", tmp_path / "scans.txt")
+    result = review(labelled_room, *words, "--cleaned", tmp_path / "cleaned.h5")
+    assert result.exit_code == 0, result.output
+    assert f"wrote {tmp_path / 'cleaned.h5'}: 4 scans dropped" in result.output
+    assert "Review of cleaned.h5" in (tmp_path / "page.html").read_text()
+    with SequenceReader(tmp_path / "cleaned.h5") as reader:
+        assert not reader.read("alignment/accepted")[[3, 10, 11, 12]].any()
+
+
+def test_review_refuses_before_anything_is_written(labelled_room, tmp_path):
+    listed = tmp_path / "scans.txt"
+    listed.write_text("3\n9999\n")
+    drop, page = ("--drop", listed), ("--out", tmp_path / "page.html")
+    cleaned = ("--cleaned", tmp_path / "cleaned.h5")
+    for words in (drop, cleaned):
+        result = review(labelled_room, *page, *words)
+        assert result.exit_code == 2
+        assert "belong together" in result.output
+    found = review(labelled_room, *page, *drop, *cleaned).exception
+    assert "line 2: the sequence has 60 scans" in str(found)
+    for target in ((labelled_room, *cleaned), (listed, *cleaned), (cleaned[1], *cleaned)):
+        result = review(labelled_room, "--out", target[0], *drop, *target[1:], "--force")
+        assert "is an input itself" in str(result.exception)
+    result = review(labelled_room, *page, *drop, "--cleaned", labelled_room, "--force")
+    assert "is an input itself" in str(result.exception)
+    assert [path.name for path in tmp_path.iterdir()] == ["scans.txt"]
+
+
 def test_the_summary_is_printed_even_where_the_picture_fails(words, tmp_path, monkeypatch):
     def fail(*_paths):
         raise OSError("disk full")

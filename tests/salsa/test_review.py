@@ -10,48 +10,21 @@ import pytest
 
 from salsa import inspection, review
 from salsa.dropping import drop_scans
-from salsa.inspection import check_labelled, coverage, inspect_sequence
-from salsa.pictures import Sheet
 from salsa.review import NO_RETURN, write_review
-from salsa.sequences import label_sequence
 from semantic2d_dataset.errors import InvalidInputError, WriteError
 from semantic2d_dataset.format.sequence import SequenceReader
-from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
 from tests.generators import make_sequence
 from tests.salsa import rooms
-from tests.salsa.test_sequences import write_source
+from tests.salsa.conftest import BLIND, LOST, SCANS
 
-SCANS = 60
-BLIND = slice(20, 24)  # these scans show something else
-LOST = 5  # has no pose
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory):
-    """A labelled sequence of which four scans do not fit and one has no pose."""
-    folder = tmp_path_factory.mktemp("review")
-    truth = rooms.true_poses(SCANS)
-    batch = rooms.batch_at(truth, rooms.rough_poses(truth, metres=0.25))
-    rng = np.random.default_rng(5)
-    batch.ranges[BLIND] = rng.uniform(0.2, 2.5, batch.ranges[BLIND].shape)
-    batch.poses[LOST] = np.nan
-    write_source(folder / "source.h5", batch)
-    map_yaml, annotation = rooms.write_room(folder)
-    label_sequence(folder / "source.h5", map_yaml, annotation, folder / "labelled.h5")
-    return folder / "labelled.h5"
-
-
-@pytest.fixture(scope="module")
-def page(labelled):
-    write_review(labelled.with_name("review.html"), labelled)
-    return labelled.with_name("review.html")
-
-
-def inspect(path):
-    with SequenceReader(path) as reader:
-        scene = check_labelled(reader)
-        return inspect_sequence(reader, scene, Sheet.over(scene)), scene
+def page(labelled_room, tmp_path_factory):
+    path = tmp_path_factory.mktemp("review") / "review.html"
+    write_review(path, labelled_room)
+    return path
 
 
 class Page(HTMLParser):
@@ -108,13 +81,13 @@ def test_the_head_says_what_became_of_the_scans(page):
         assert f"</span>{name}</td>" in text
 
 
-def test_embedded_scans_are_those_of_the_file(labelled, page):
+def test_embedded_scans_are_those_of_the_file(labelled_room, page):
     data = read_page(page).data
     scans, step = data["scans"], data["lidar"]["step_m"]
     shape = (len(scans["index"]), data["lidar"]["beams"])
     codes = np.frombuffer(base64.b64decode(scans["ranges"]), "<u2").reshape(shape)
     labels = np.frombuffer(base64.b64decode(scans["labels"]), np.uint8).reshape(shape)
-    with SequenceReader(labelled) as reader:
+    with SequenceReader(labelled_room) as reader:
         batch = reader.batch()
         assert scans["index"] == list(range(SCANS))
         np.testing.assert_array_equal(codes != NO_RETURN, batch.valid)
@@ -128,17 +101,17 @@ def test_embedded_scans_are_those_of_the_file(labelled, page):
     assert scans["inliers"][30] == pytest.approx(100 * ratio[30], abs=0.1)
     assert scans["refined"][LOST] == [None] * 3
     kinds = np.zeros(SCANS, int)
-    kinds[BLIND], kinds[LOST] = 1, 3
+    kinds[list(BLIND)], kinds[LOST] = 1, 3
     assert scans["kind"] == kinds.tolist()
 
 
-def test_the_fit_over_time_keeps_every_extreme(page, labelled, monkeypatch, tmp_path):
+def test_the_fit_over_time_keeps_every_extreme(page, labelled_room, monkeypatch, tmp_path):
     monkeypatch.setattr(review, "_BINS", 7)
-    write_review(tmp_path / "review.html", labelled)
+    write_review(tmp_path / "review.html", labelled_room)
     short, full = read_page(tmp_path / "review.html").data["time"], read_page(page).data["time"]
     assert len(short["seconds"]) == 7
     assert len(full["seconds"]) == SCANS
-    assert full["refused"] == [i in range(*BLIND.indices(SCANS)) for i in range(SCANS)]
+    assert full["refused"] == [i in BLIND for i in range(SCANS)]
     assert sum(short["refused"]) in (1, 2)
     for name, series in full["series"].items():
         low, high = (
@@ -148,79 +121,47 @@ def test_the_fit_over_time_keeps_every_extreme(page, labelled, monkeypatch, tmp_
         assert max(short["series"][name]["high"]) == max(high), name
 
 
-def test_a_long_recording_is_thinned_but_the_worst_stay(labelled, monkeypatch, tmp_path):
+def test_a_long_recording_is_thinned_but_the_worst_stay(labelled_room, monkeypatch, tmp_path):
     monkeypatch.setattr(review, "_SHOWN", 10)
     monkeypatch.setattr(review, "_WORST", 3)
-    write_review(tmp_path / "review.html", labelled)
+    write_review(tmp_path / "review.html", labelled_room)
     read = read_page(tmp_path / "review.html")
     (worst,) = (value for _, name, value in read.found if name == "data-scans")
     index = read.data["scans"]["index"]
     assert len(index) <= 13
     assert {0, SCANS - 1, *map(int, worst.split())} <= set(index)
     monkeypatch.setattr(review, "_SCAN_BYTES", 5 * 3 * rooms.LIDAR.beams)
-    write_review(tmp_path / "review.html", labelled)
+    write_review(tmp_path / "review.html", labelled_room)
     assert len(read_page(tmp_path / "review.html").data["scans"]["index"]) <= 5
 
 
-def test_the_worst_come_first_and_one_of_each_stretch(labelled):
-    found, _ = inspect(labelled)
-    blind = range(*BLIND.indices(SCANS))
-    assert set(found.worst(4).tolist()) == set(blind)
-    assert LOST not in found.worst(SCANS)
-    assert (np.diff(found.badness[found.worst(SCANS)]) <= 0).all()
-    assert np.nanmin(found.badness) >= 0
-    assert np.nanmax(found.badness) <= 5
-    assert len(found.worst(12)) == 12
-
-
-def test_of_a_long_bad_stretch_only_the_worst_is_shown(tmp_path):
-    found = np.zeros(1000)
-    found[100:105] = (1, 2, 5, 2, 1)
-    found[700] = 3
-    one = object.__new__(inspection.Inspection)
-    one.__dict__.update(badness=found, seconds=found)
-    assert one.worst(2).tolist() == [102, 700]
-
-
-def test_blocks_change_nothing(labelled, page, monkeypatch, tmp_path):
+def test_blocks_change_nothing(labelled_room, page, monkeypatch, tmp_path):
     monkeypatch.setattr(inspection, "BLOCK_SCANS", 7)
-    write_review(tmp_path / "review.html", labelled)
+    write_review(tmp_path / "review.html", labelled_room)
     assert (tmp_path / "review.html").read_bytes() == page.read_bytes()
 
 
-def test_coverage_tells_what_was_met(labelled):
-    found, scene = inspect(labelled)
-    met = coverage(found, scene)
-    assert set(met) == {SEMANTIC2D.id_of(name) for name in rooms.BOXES}
-    sofa, wall = met[SEMANTIC2D.id_of("Sofa")], met[SEMANTIC2D.id_of("Wall")]
-    assert sofa[0] == (scene.labels == SEMANTIC2D.id_of("Sofa")).sum()
-    assert 0.3 < sofa[1] < 0.9  # two of its sides are behind it
-    assert wall[1] > 0.5
-    found.hit[:] = False
-    assert coverage(found, scene)[SEMANTIC2D.id_of("Wall")][1] == 0.0
-
-
-def test_a_cleaned_copy_says_what_was_dropped(labelled, tmp_path):
-    drop_scans(labelled, [20, 21, 22, 40], tmp_path / "cleaned.h5")
+def test_a_cleaned_copy_says_what_was_dropped(labelled_room, tmp_path):
+    drop_scans(labelled_room, [20, 21, 22, 40], tmp_path / "cleaned.h5")
     write_review(tmp_path / "review.html", tmp_path / "cleaned.h5")
     text, read = (tmp_path / "review.html").read_text(), read_page(tmp_path / "review.html")
     said = dict(re.findall(r"<div>([^<]+)<b>([^<]+)</b></div>", text))
     assert (said["dropped"], said["not accepted"], said["accepted"]) == ("4", "1", "54")
     assert read.data["dropped"] == ["20-22", "40"]
-    found, _ = inspect(tmp_path / "cleaned.h5")
-    assert found.worst(1).tolist() == [23]
+    (worst,) = (value for _, name, value in read.found if name == "data-scans")
+    assert worst.split()[0] == "23"
 
 
-def test_a_page_can_be_made_where_every_scan_was_dropped(labelled, tmp_path):
-    drop_scans(labelled, np.arange(SCANS), tmp_path / "cleaned.h5")
+def test_a_page_can_be_made_where_every_scan_was_dropped(labelled_room, tmp_path):
+    drop_scans(labelled_room, np.arange(SCANS), tmp_path / "cleaned.h5")
     write_review(tmp_path / "review.html", tmp_path / "cleaned.h5")
     assert "None is left" in (tmp_path / "review.html").read_text()
     assert read_page(tmp_path / "review.html").data["total"] == SCANS
 
 
-def test_a_name_cannot_inject_anything(labelled, tmp_path):
+def test_a_name_cannot_inject_anything(labelled_room, tmp_path):
     odd = tmp_path / "<script>alert(1)<.h5"
-    shutil.copyfile(labelled, odd)
+    shutil.copyfile(labelled_room, odd)
     write_review(tmp_path / "review.html", odd)
     text = (tmp_path / "review.html").read_text()
     assert "<script>alert" not in text
@@ -234,9 +175,9 @@ def test_what_is_not_labelled_leaves_no_page(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["truth.h5"]
 
 
-def test_a_page_needs_its_folder(labelled, tmp_path):
+def test_a_page_needs_its_folder(labelled_room, tmp_path):
     with pytest.raises(WriteError, match="does not exist"):
-        write_review(tmp_path / "none" / "review.html", labelled)
+        write_review(tmp_path / "none" / "review.html", labelled_room)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium to open the page")
