@@ -229,6 +229,24 @@ def plot(
     typer.echo(f"wrote {out}")
 
 
+@app.command()
+def view(
+    sequence: Annotated[Path, typer.Argument(help="Sequence file.")],
+    *,
+    every: Annotated[int, typer.Option(min=1, help="Show one scan of so many.")] = 1,
+    save: Annotated[
+        Path | None, typer.Option(help="Rerun recording (.rrd) to write; no viewer is opened.")
+    ] = None,
+) -> None:
+    """Open a sequence in the Rerun viewer (extra 'view')."""
+    from semantic2d_dataset.viewing import view_sequence
+
+    if save is not None:
+        _check_page(save, sequence)
+    shown = view_sequence(sequence, every=every, save=save)
+    typer.echo(f"{'showing' if save is None else f'wrote {save}:'} {shown} scans")
+
+
 @app.command(context_settings=_FORWARDED, add_help_option=False)
 def inspect(context: typer.Context) -> None:
     """Say what a recording holds, and how it would be converted."""

@@ -304,7 +304,7 @@ def _draw_robot(ax: Axes, pose: Pose2) -> None:
 def _draw_map(ax: Axes, scene: SemanticMap, taxonomy: Taxonomy, *, opacity: float = 1.0) -> None:
     rows, columns = scene.occupancy.shape
     to_map = Affine2D().rotate(scene.origin.yaw).translate(scene.origin.x, scene.origin.y)
-    colours = _faded(_cell_colours(scene, taxonomy), opacity)
+    colours = _faded(cell_colours(scene, taxonomy), opacity)
     ax.imshow(
         colours,
         origin="lower",
@@ -328,7 +328,7 @@ def _faded(rgb: ArrayLike, opacity: float) -> NDArray[np.uint8]:
     return mixed.astype(np.uint8)
 
 
-def _cell_colours(scene: SemanticMap, taxonomy: Taxonomy) -> NDArray[np.uint8]:
+def cell_colours(scene: SemanticMap, taxonomy: Taxonomy) -> NDArray[np.uint8]:
     """Colours (H, W, 3) u1 of cells: what they are, and their class where they are occupied."""
     palette = taxonomy.palette
     palette[len(taxonomy) :] = _OCCUPIED_RGB

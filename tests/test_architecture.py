@@ -23,6 +23,7 @@ ROOMS = (
     "plotting",
     "summaries",
     "reports",
+    "viewing",
     "pipeline",
     "cli",
 )

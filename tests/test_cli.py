@@ -48,6 +48,7 @@ def test_help_lists_every_command(run):
         "score",
         "report",
         "plot",
+        "view",
         "convert",
         "salsa",
         "baseline",
@@ -105,6 +106,8 @@ COMMANDS = {
     "score": ["score", "{bad}"],
     "report": ["report", "{bad}", "--out", "{out}"],
     "plot": ["plot", "{bad}", "--out", "{out}.png"],
+    "view": ["view", "{bad}", "--save", "{out}"],
+    "salsa review": ["salsa", "review", "{bad}", "--out", "{out}"],
     "convert": ["convert", "{bad}", "--out", "{out}"],
     "salsa sequence": [
         "salsa",
@@ -233,6 +236,24 @@ def test_plot_draws_a_scan_over_its_map(run, tmp_path):
     make_sequence(tmp_path / "a.h5", 10)
     assert run("plot", tmp_path / "a.h5", "--scan", "3", "--out", tmp_path / "a.png")[0] == 0
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_view_writes_a_recording_where_asked_to(run, tmp_path):
+    pytest.importorskip("rerun", reason="needs the extra 'view'")
+    make_sequence(tmp_path / "a.h5", 10)
+    status, out, _ = run("view", tmp_path / "a.h5", "--every", "3", "--save", tmp_path / "a.rrd")
+    assert (status, out) == (0, f"wrote {tmp_path / 'a.rrd'}: 4 scans\n")
+    assert (tmp_path / "a.rrd").read_bytes().startswith(b"RRF")
+
+
+def test_view_without_its_extra_says_how_to_get_it(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    make_sequence(tmp_path / "a.h5", 10)
+    status, _, err = run("view", tmp_path / "a.h5", "--save", tmp_path / "a.rrd")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "pip install 'semantic2d-dataset[view]'" in err
+    status, _, err = run("view", tmp_path / "a.h5", "--save", tmp_path / "a.h5")
+    assert (status, "is the input itself" in err) == (1, True)
 
 
 def test_shadowing_package_is_named_with_a_way_out(tmp_path, monkeypatch):
