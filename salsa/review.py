@@ -118,8 +118,8 @@ def _figures(found: Inspection) -> list[tuple[str, str]]:
         ("dropped", f"{found.dropped.sum():,}"),
         ("beams labelled", f"{labelled:.1f} %"),
         ("median residual", _median(100 * found.residual_m[good], "cm")),
-        ("within 10 cm, before", _median(100 * found.near_before[known], "%")),
-        ("and after", _median(100 * found.inlier_ratio[known], "%")),
+        ("within 10 cm, rough", _median(100 * found.near_before[known], "%")),
+        ("within 10 cm, refined", _median(100 * found.inlier_ratio[known], "%")),
     ]
     return [each for each in figures if each != ("dropped", "0")]
 

@@ -73,7 +73,7 @@ def test_the_head_says_what_became_of_the_scans(page):
     said = dict(re.findall(r"<div>([^<]+)<b>([^<]+)</b></div>", text))
     assert (said["scans"], said["accepted"], said["not accepted"]) == ("60", "55", "4")
     assert said["without pose"] == "1"
-    before, after = said["within 10 cm, before"], said["and after"]
+    before, after = said["within 10 cm, rough"], said["within 10 cm, refined"]
     assert float(before.split()[0]) < 90 < float(after.split()[0])
     assert 0.5 < float(said["median residual"].split()[0]) < 3
     assert "dropped" not in said
