@@ -191,8 +191,189 @@ def test_people_of_a_type_that_only_the_bag_knows_are_kept(kind, tmp_path):
     assert column(arrays, "people", "pose.position.y").tolist() == [2, 4, 6]
     assert column(arrays, "people", "id").tolist() == [7, 8, 7]
     said = about(arrays, "people")
-    assert said["left_out"] == ["note", "people.name"]
+    assert said["left_out"] == ["note"]
     assert (said["frames"], said["stamps"]) == (["odom"], "header")
+    assert said["words"] == {"name": ["somebody"]}
+    assert column(arrays, "people", "name").tolist() == [0, 0, 0]
+
+
+def named_drive(kind, names):
+    """One message; a person of each name."""
+    drive = people_drive(kind, [[(0.0, 0.0, 7)] * len(names)])
+    for person, name in zip(drive.messages[0][3].people, names, strict=True):
+        person.name = name
+    return drive
+
+
+@settings(max_examples=8)
+@given(names=st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))))
+def test_every_text_comes_back_by_its_number(names, tmp_path_factory):
+    path = named_drive("mcap", names).write(tmp_path_factory.mktemp("names"))
+    arrays = read(path, ["people"])
+    words, codes = about(arrays, "people")["words"]["name"], column(arrays, "people", "name")
+    assert [words[int(code)] for code in codes] == names
+    assert len(set(words)) == len(words)
+
+
+def test_texts_beyond_what_a_file_can_say_have_no_number_and_the_others_keep_theirs(tmp_path):
+    long = [f"{n}" * (1 << 18) for n in range(6)]
+    arrays = read(named_drive("mcap", ["ann", *long, "ann", "bob"]).write(tmp_path), ["people"])
+    codes = column(arrays, "people", "name").tolist()
+    assert codes == [0, 1, 2, 3, -1, -1, -1, 0, 4]
+    assert about(arrays, "people")["words"]["name"] == ["ann", *long[:3], "bob"]
+    assert arrays["streams/people/about"].nbytes < 1 << 24
+
+
+LINE = "=" * 80
+DETECTION = f"""{{header}} header
+vision_msgs/Detection2D[] detections
+{LINE}
+MSG: vision_msgs/Detection2D
+{{header}} header
+vision_msgs/ObjectHypothesisWithPose[] results
+vision_msgs/BoundingBox2D bbox
+{{more}}
+{LINE}
+MSG: vision_msgs/BoundingBox2D
+{{centre}} center
+float64 size_x
+float64 size_y
+{LINE}
+MSG: vision_msgs/ObjectHypothesisWithPose
+{{what}}
+geometry_msgs/PoseWithCovariance pose
+"""
+NEW_DETECTION = f"""{DETECTION}{LINE}
+MSG: vision_msgs/Pose2D
+vision_msgs/Point2D position
+float64 theta
+{LINE}
+MSG: vision_msgs/Point2D
+float64 x
+float64 y
+{LINE}
+MSG: vision_msgs/ObjectHypothesis
+string class_id
+float64 score
+"""
+NOETIC = DETECTION.format(
+    header="Header",
+    more="sensor_msgs/Image source_img",
+    centre="geometry_msgs/Pose2D",
+    what="int64 id\nfloat64 score",
+)
+FOXY = DETECTION.format(
+    header="std_msgs/Header",
+    more="bool is_tracking\nstring tracking_id",
+    centre="geometry_msgs/Pose2D",
+    what="string id\nfloat64 score",
+)
+HUMBLE = NEW_DETECTION.format(
+    header="std_msgs/Header",
+    more="string id",
+    centre="vision_msgs/Pose2D",
+    what="vision_msgs/ObjectHypothesis hypothesis",
+)
+DETECTIONS = "vision_msgs/msg/Detection2DArray"
+
+
+def detection_drive(kind, definition, frames):
+    """Each frame is a list of boxes (x, y, width, height, {class: score})."""
+    drive = Recording(kind)
+    drive.store.register(get_types_from_msg(definition, DETECTIONS))
+    for n, boxes in enumerate(frames):
+        header = drive.header(START_NS + n * SECOND, "camera")
+        detections = [detection(drive, header, *box) for box in boxes]
+        message = drive.new(DETECTIONS, header=header, detections=detections)
+        drive.add("/detections", message, START_NS + n * SECOND + 7)
+    return drive
+
+
+def detection(drive, header, x, y, width, height, classes):
+    fields = drive.store.types["vision_msgs/msg/Detection2D"].__dataclass_fields__
+    if "vision_msgs/msg/Pose2D" in drive.store.types:
+        point = drive.new("vision_msgs/msg/Point2D", x=x, y=y)
+        centre = drive.new("vision_msgs/msg/Pose2D", position=point, theta=0.0)
+    else:
+        centre = drive.new("geometry_msgs/msg/Pose2D", x=x, y=y, theta=0.0)
+    more = {"is_tracking": True, "tracking_id": "t1", "id": "t1"}
+    if "source_img" in fields:
+        more["source_img"] = image(drive, BYTES[..., 0], "mono8")
+    return drive.new(
+        "vision_msgs/msg/Detection2D",
+        header=header,
+        results=[hypothesis(drive, name, score) for name, score in classes.items()],
+        bbox=drive.new("vision_msgs/msg/BoundingBox2D", center=centre, size_x=width, size_y=height),
+        **{name: value for name, value in more.items() if name in fields},
+    )
+
+
+def hypothesis(drive, name, score):
+    type_ = "vision_msgs/msg/ObjectHypothesisWithPose"
+    pose = drive.new(
+        "geometry_msgs/msg/PoseWithCovariance", pose=drive.pose(0, 0, 0), covariance=np.zeros(36)
+    )
+    if "vision_msgs/msg/ObjectHypothesis" in drive.store.types:
+        inner = drive.new("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
+        return drive.new(type_, hypothesis=inner, pose=pose)
+    return drive.new(type_, id=name, score=score, pose=pose)
+
+
+@pytest.mark.parametrize(
+    ("kind", "definition", "names", "where", "what", "score", "tracks"),
+    [
+        ("ros1", NOETIC, (18, 1), "bbox.center.", "results.id", "results.score", None),
+        (
+            "db3",
+            FOXY,
+            ("dog", "person"),
+            "bbox.center.",
+            "results.id",
+            "results.score",
+            "tracking_id",
+        ),
+        (
+            "mcap",
+            HUMBLE,
+            ("dog", "person"),
+            "bbox.center.position.",
+            "results.hypothesis.class_id",
+            "results.hypothesis.score",
+            "id",
+        ),
+    ],
+)
+def test_detections_keep_their_boxes_and_their_best_class(
+    kind, definition, names, where, what, score, tracks, tmp_path
+):
+    dog, person = names
+    frames = [
+        [(10.0, 20.0, 4.0, 6.0, {person: 0.25, dog: 0.75}), (30.0, 40.0, 5.0, 7.0, {person: 0.5})],
+        [],
+        [(50.0, 60.0, 2.0, 3.0, {})],
+    ]
+    arrays = read(detection_drive(kind, definition, frames).write(tmp_path), ["detections"])
+    assert arrays["streams/detections/offsets"].tolist() == [0, 2, 2, 3]
+    stamps = [START_NS + n * SECOND for n in range(3)]
+    assert arrays["streams/detections/stamps_ns"].tolist() == stamps
+    for name, wanted in (
+        (f"{where}x", [10, 30, 50]),
+        (f"{where}y", [20, 40, 60]),
+        ("bbox.size_x", [4, 5, 2]),
+        ("bbox.size_y", [6, 7, 3]),
+        (score, [0.75, 0.5, np.nan]),
+    ):
+        np.testing.assert_array_equal(column(arrays, "detections", name), wanted)
+    said, found = about(arrays, "detections"), column(arrays, "detections", what)
+    assert said["best_of"] == ["results"]
+    assert np.isnan(found[2])
+    if what in said.get("words", ()):
+        assert [said["words"][what][int(code)] for code in found[:2]] == [dog, person]
+    else:
+        assert found[:2].tolist() == [dog, person]
+    if tracks:
+        assert said["words"][tracks] == ["t1"]
+    assert "detections.results" not in said["left_out"]
 
 
 @settings(max_examples=8)
