@@ -17,6 +17,7 @@ from conversion.ros.bags import Bag
 from conversion.ros.streams import choose_streams, read_streams
 from semantic2d_dataset.errors import RecordingError
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
+from tests.conversion.detections import FOXY, HUMBLE, NOETIC, detection_drive
 from tests.conversion.recordings import KINDS, ODOMETRY, POSE, START_NS, Recording
 from tests.generators import SMALL_LIDAR, make_arrays
 
@@ -222,101 +223,6 @@ def test_texts_beyond_what_a_file_can_say_have_no_number_and_the_others_keep_the
     assert codes == [0, 1, 2, 3, -1, -1, -1, 0, 4]
     assert about(arrays, "people")["words"]["name"] == ["ann", *long[:3], "bob"]
     assert arrays["streams/people/about"].nbytes < 1 << 24
-
-
-LINE = "=" * 80
-DETECTION = f"""{{header}} header
-vision_msgs/Detection2D[] detections
-{LINE}
-MSG: vision_msgs/Detection2D
-{{header}} header
-vision_msgs/ObjectHypothesisWithPose[] results
-vision_msgs/BoundingBox2D bbox
-{{more}}
-{LINE}
-MSG: vision_msgs/BoundingBox2D
-{{centre}} center
-float64 size_x
-float64 size_y
-{LINE}
-MSG: vision_msgs/ObjectHypothesisWithPose
-{{what}}
-geometry_msgs/PoseWithCovariance pose
-"""
-NEW_DETECTION = f"""{DETECTION}{LINE}
-MSG: vision_msgs/Pose2D
-vision_msgs/Point2D position
-float64 theta
-{LINE}
-MSG: vision_msgs/Point2D
-float64 x
-float64 y
-{LINE}
-MSG: vision_msgs/ObjectHypothesis
-string class_id
-float64 score
-"""
-NOETIC = DETECTION.format(
-    header="Header",
-    more="sensor_msgs/Image source_img",
-    centre="geometry_msgs/Pose2D",
-    what="int64 id\nfloat64 score",
-)
-FOXY = DETECTION.format(
-    header="std_msgs/Header",
-    more="bool is_tracking\nstring tracking_id",
-    centre="geometry_msgs/Pose2D",
-    what="string id\nfloat64 score",
-)
-HUMBLE = NEW_DETECTION.format(
-    header="std_msgs/Header",
-    more="string id",
-    centre="vision_msgs/Pose2D",
-    what="vision_msgs/ObjectHypothesis hypothesis",
-)
-DETECTIONS = "vision_msgs/msg/Detection2DArray"
-
-
-def detection_drive(kind, definition, frames):
-    """Each frame is a list of boxes (x, y, width, height, {class: score})."""
-    drive = Recording(kind)
-    drive.store.register(get_types_from_msg(definition, DETECTIONS))
-    for n, boxes in enumerate(frames):
-        header = drive.header(START_NS + n * SECOND, "camera")
-        detections = [detection(drive, header, *box) for box in boxes]
-        message = drive.new(DETECTIONS, header=header, detections=detections)
-        drive.add("/detections", message, START_NS + n * SECOND + 7)
-    return drive
-
-
-def detection(drive, header, x, y, width, height, classes):
-    fields = drive.store.types["vision_msgs/msg/Detection2D"].__dataclass_fields__
-    if "vision_msgs/msg/Pose2D" in drive.store.types:
-        point = drive.new("vision_msgs/msg/Point2D", x=x, y=y)
-        centre = drive.new("vision_msgs/msg/Pose2D", position=point, theta=0.0)
-    else:
-        centre = drive.new("geometry_msgs/msg/Pose2D", x=x, y=y, theta=0.0)
-    more = {"is_tracking": True, "tracking_id": "t1", "id": "t1"}
-    if "source_img" in fields:
-        more["source_img"] = image(drive, BYTES[..., 0], "mono8")
-    return drive.new(
-        "vision_msgs/msg/Detection2D",
-        header=header,
-        results=[hypothesis(drive, name, score) for name, score in classes.items()],
-        bbox=drive.new("vision_msgs/msg/BoundingBox2D", center=centre, size_x=width, size_y=height),
-        **{name: value for name, value in more.items() if name in fields},
-    )
-
-
-def hypothesis(drive, name, score):
-    type_ = "vision_msgs/msg/ObjectHypothesisWithPose"
-    pose = drive.new(
-        "geometry_msgs/msg/PoseWithCovariance", pose=drive.pose(0, 0, 0), covariance=np.zeros(36)
-    )
-    if "vision_msgs/msg/ObjectHypothesis" in drive.store.types:
-        inner = drive.new("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
-        return drive.new(type_, hypothesis=inner, pose=pose)
-    return drive.new(type_, id=name, score=score, pose=pose)
 
 
 @pytest.mark.parametrize(
