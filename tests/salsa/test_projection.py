@@ -236,22 +236,24 @@ def test_a_box_above_the_scan_is_not_met_unless_any_height_is():
     assert (labels[meets == 0] == DOG).all()
 
 
-def test_a_box_cut_by_the_border_of_the_image_goes_on_below_it():
-    near = (1.9, 3.4, 2.3, 3.65, 0.5)  # its feet are below the image
-    made = scans(POSE, things=(near,))
+@pytest.mark.parametrize(
+    ("thing", "tilt", "cut", "shift"),
+    [
+        ((1.9, 3.4, 2.3, 3.65, 0.5), 0.3, (3, CAMERA.height), (0, 0, 0, -10)),
+        ((3.15, 3.4, 3.5, 3.65, 0.5), -1.0, (1, 0), (0, 10, 0, 0)),
+    ],
+)
+def test_a_box_cut_by_the_border_of_the_image_goes_on_beyond_it(thing, tilt, cut, shift):
+    made = scans(POSE, things=(thing,))
     batch, _, _, meets = made
-    upward = mount_matrix((0.2, 0.05, 0.6, -np.pi / 2 + 0.3, 0.0, -np.pi / 2))
-    camera = replace(CAMERA, parent_T_camera=upward)
-    left, top, right, bottom = box_of(near, camera=camera)
-    assert bottom == camera.height
-    slim = Matching(above=0.0)
-    labels, _ = apply(
-        made, seen(batch, [(left, top, right, bottom)], [DOG]), camera=camera, matching=slim
-    )
-    assert (labels[meets == 0] == DOG).all()
-    short = [(left, top, right, bottom - 10)]
-    labels, _ = apply(made, seen(batch, short, [DOG]), camera=camera, matching=slim)
-    assert (labels[meets == 0] == PERSON).all()
+    tilted = mount_matrix((*FORWARD[:3], FORWARD[3] + tilt, *FORWARD[4:]))
+    camera = replace(CAMERA, parent_T_camera=tilted)
+    box = box_of(thing, camera=camera)
+    assert box[cut[0]] == cut[1]
+    for boxes, found in (([box], DOG), ([np.add(box, shift)], PERSON)):
+        detections = seen(batch, boxes, [DOG])
+        labels, _ = apply(made, detections, camera=camera, matching=Matching(above=0.0))
+        assert (labels[meets == 0] == found).all()
 
 
 @settings(max_examples=30)
