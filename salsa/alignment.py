@@ -22,7 +22,7 @@ from salsa.fields import MapField, as_field
 from salsa.registration import Beams, beams_of
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError
 from semantic2d_dataset.scene.geometry import compose, invert, rotation_matrix, to_points
-from semantic2d_dataset.scene.lines import extract_lines
+from semantic2d_dataset.scene.lines import FAST, extract_lines
 from semantic2d_dataset.scene.maps import SemanticMap
 from semantic2d_dataset.scene.scans import ScanBatch
 
@@ -257,7 +257,7 @@ def _in_grid(before: Float | None, grid: Float) -> Float:
 def _near_lines(batch: ScanBatch) -> NDArray[np.bool_]:
     lidar = batch.lidar
     segments, offsets = extract_lines(
-        batch.ranges, lidar.bearings, range_min=lidar.range_min, range_max=lidar.range_max
+        batch.ranges, lidar.bearings, FAST, range_min=lidar.range_min, range_max=lidar.range_max
     )
     points = to_points(batch.ranges, lidar.bearings)
     return batch.valid & points_near_lines(points, segments, offsets)

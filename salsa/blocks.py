@@ -18,13 +18,16 @@ from salsa.annotation import annotate_map
 from salsa.evidence import Evidence, gather
 from salsa.fields import MapField, map_field
 from salsa.labelling import transfer_labels
+from salsa.projection import apply_detections
 from salsa.settings import Settings
+from salsa.sightings import Seen, Sightings, read_sightings
 from salsa.things import Things
 from semantic2d_dataset.format.schema import CHUNK_ROWS
 from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.scene.lines import extract_lines
 from semantic2d_dataset.scene.maps import SemanticMap
 from semantic2d_dataset.scene.scans import ScanBatch
+from semantic2d_dataset.scene.taxonomy import Taxonomy
 
 BLOCK_SCANS = 8 * CHUNK_ROWS
 """Scans in memory at a time; neighbours help each other within a block."""
@@ -35,7 +38,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Job:
-    """One sequence to label: its file, its map and annotation, and the parameters of all steps.
+    """One sequence to label: its files, its classes and the parameters of all steps.
 
     `digest` is that of what the files hold, so that a changed file is another job.
     """
@@ -43,6 +46,8 @@ class Job:
     source: Path
     map_yaml: Path
     annotation: Path
+    sightings: Sightings | None
+    taxonomy: Taxonomy
     settings: Settings
     digest: str
 
@@ -54,6 +59,7 @@ class Prepared:
     reader: SequenceReader
     scene: SemanticMap
     field: MapField
+    seen: Seen | None
 
 
 @dataclass(frozen=True)
@@ -78,9 +84,9 @@ class Block:
 def prepare(job: Job) -> Prepared:
     """Open the sequence of a job and measure its map; kept for the next block of the same job."""
     reader = SequenceReader(job.source)
-    taxonomy = reader.header.taxonomy
-    scene = annotate_map(job.map_yaml, job.annotation, taxonomy)
-    return Prepared(reader, scene, map_field(scene, taxonomy))
+    scene = annotate_map(job.map_yaml, job.annotation, job.taxonomy)
+    seen = read_sightings(job.sightings, reader, job.taxonomy)
+    return Prepared(reader, scene, map_field(scene, job.taxonomy), seen)
 
 
 def blocks_of(scans: int) -> list[Block]:
@@ -124,8 +130,20 @@ def label_block(job: Job, things: Things, block: Block) -> Arrays:
         quality=found.inlier_ratio,
         things=things.layer(prepared.field.free.shape),
         transfer=job.settings.transfer,
-        taxonomy=prepared.reader.header.taxonomy,
+        taxonomy=job.taxonomy,
     )
+    if prepared.seen is not None:
+        camera, detections, matching = prepared.seen
+        labels, confidence = apply_detections(
+            batch,
+            found.poses,
+            labels,
+            confidence,
+            camera,
+            detections,
+            matching=matching,
+            taxonomy=job.taxonomy,
+        )
     segments, offsets = extract_lines(
         batch.ranges,
         batch.lidar.bearings,

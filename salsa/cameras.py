@@ -174,6 +174,19 @@ def read_camera(path: Path) -> Camera:
     return _ros_camera(path, found, pose, parent)
 
 
+def camera_files(path: Path) -> dict[str, Path]:
+    """Return the files that a camera is read from, by their role.
+
+    Raises
+    ------
+    FileNotFoundError, InvalidInputError
+        If the first of them is missing, or not a mapping.
+    """
+    path = Path(path)
+    named = _read_mapping(path).get("camera_info")
+    return {"camera": path} | ({"camera_info": path.parent / str(named)} if named else {})
+
+
 def _own_camera(found: Mapping[str, Any], pose: Float, parent: str) -> Camera:
     missing = [key for key in (*_SIZE, *_LENS) if key not in found]
     if missing:

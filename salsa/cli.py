@@ -12,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from salsa.map_check import MapReport
     from salsa.sequences import Summary
+    from salsa.sightings import Sightings
 
 app = typer.Typer(
     name="salsa",
@@ -59,6 +60,21 @@ def label(
             "--ignore-no-return", help="Leave beams without a return unlabelled, not Other."
         ),
     ] = False,
+    camera: Annotated[
+        Path | None, typer.Option(help="Calibrated camera (YAML) that saw other moving things.")
+    ] = None,
+    detections: Annotated[
+        str | None, typer.Option(help="Detections in its images: a JSON file, or stream:NAME.")
+    ] = None,
+    detection_names: Annotated[
+        Path | None, typer.Option(help="YAML: what the detector's classes are called here.")
+    ] = None,
+    camera_clock_offset: Annotated[
+        float, typer.Option(help="Added to the stamps of the images, s.")
+    ] = 0.0,
+    taxonomy: Annotated[
+        Path | None, typer.Option(help="Classes (YAML); those of the sequence if not given.")
+    ] = None,
     jobs: Annotated[
         int, typer.Option(min=1, help="Processes; one already uses all cores for most of it.")
     ] = 1,
@@ -76,6 +92,7 @@ def label(
     from salsa.smoothing import Smoothing
     from salsa.things import Persistence
     from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.scene.taxonomy import read_taxonomy
 
     if plot is not None:  # before hours of work
         from semantic2d_dataset.plotting import check_picture_name
@@ -88,6 +105,7 @@ def label(
         persistence=Persistence(min_seconds=static_after) if static_after else None,
         transfer=Transfer(ignore_no_return=ignore_no_return),
     )
+    sightings = _sightings(camera, detections, detection_names, camera_clock_offset)
     with open_executor(jobs=jobs, scheduler=scheduler) as executor:
         summary = label_sequence(
             sequence,
@@ -95,6 +113,8 @@ def label(
             annotation,
             out,
             settings=settings,
+            sightings=sightings,
+            taxonomy=None if taxonomy is None else read_taxonomy(taxonomy),
             force=force,
             executor=executor,
         )
@@ -103,6 +123,20 @@ def label(
         from salsa.pictures import plot_labelled_sequence
 
         plot_labelled_sequence(out, plot)
+
+
+def _sightings(
+    camera: Path | None, detections: str | None, names: Path | None, clock_offset_s: float
+) -> Sightings | None:
+    from salsa.projection import Matching
+    from salsa.sightings import Sightings
+    from semantic2d_dataset.errors import InvalidInputError
+
+    if camera is None and detections is None and names is None:
+        return None
+    if camera is None or detections is None:
+        raise InvalidInputError("--camera and --detections need each other; give both")
+    return Sightings(camera, detections, names, Matching(clock_offset_s=clock_offset_s))
 
 
 @app.command(name="map")

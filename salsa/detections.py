@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import yaml
@@ -22,8 +21,6 @@ MIN_SCORE = 0.5
 
 STREAM = "stream:"
 """What the name of a stream is given after, in place of a file."""
-
-Unknown = Literal["error", "other"]
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,6 @@ def read_detections(
     taxonomy: Taxonomy = SEMANTIC2D,
     *,
     names: Mapping[str, str | None] | None = None,
-    unknown: Unknown = "error",
     min_score: float = MIN_SCORE,
 ) -> Detections:
     """Read the detections that belong to a sequence.
@@ -97,8 +93,6 @@ def read_detections(
     names
         What classes of the detector (names, or numbers as text) are in the taxonomy; None means
         to leave such detections out. Names that it lacks are looked up as they are.
-    unknown
-        What to do with classes that the taxonomy lacks: ``error``, or call them ``other``.
     min_score
         Detections with a lower score are left out.
 
@@ -120,7 +114,7 @@ def read_detections(
     if not stamps:
         raise InvalidInputError(f"{where}: holds no image, so nothing can be told from it")
     sure = [entry for entry in entries if entry.score >= min_score]
-    ids = _ids_of(where, {entry.name for entry in sure}, taxonomy, names or {}, unknown)
+    ids = _ids_of(where, {entry.name for entry in sure}, taxonomy, names or {})
     kept = [entry for entry in sure if ids[entry.name] is not None]
     return _gathered(stamps, kept, [ids[entry.name] for entry in kept])
 
@@ -163,7 +157,6 @@ def _ids_of(
     found: Collection[str],
     taxonomy: Taxonomy,
     names: Mapping[str, str | None],
-    unknown: Unknown,
 ) -> dict[str, int | None]:
     """Return the class of each name; None for what is left out."""
     ids: dict[str, int | None] = {}
@@ -175,9 +168,7 @@ def _ids_of(
         except InvalidInputError as err:
             if name in names:
                 raise InvalidInputError(f"the class named for {name!r}: {err}") from err
-            ids[name] = taxonomy.background_id
-            if unknown == "error" or name.isdecimal():  # a number may well mean Person
-                strange.append(repr(name))
+            strange.append(repr(name))
     if strange:
         raise InvalidInputError(
             f"{where}: detected classes {', '.join(strange)} are not known; known are "

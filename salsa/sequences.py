@@ -32,13 +32,15 @@ from salsa.blocks import (
     rough_poses,
     rows_of,
 )
+from salsa.copying import copy_arrays
 from salsa.evidence import Ledger, coarse
 from salsa.settings import Settings
+from salsa.sightings import Sightings, sighting_files
 from salsa.smoothing import read_odometry, smooth
 from salsa.things import NO_THINGS, Things, find_things
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
 from semantic2d_dataset.executors import Executor, Serial
-from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
+from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
 from semantic2d_dataset.scene.maps import map_image
 from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
 
@@ -91,6 +93,8 @@ def label_sequence(
     out: Path,
     *,
     settings: Settings | None = None,
+    sightings: Sightings | None = None,
+    taxonomy: Taxonomy | None = None,
     force: bool = False,
     executor: Executor | None = None,
 ) -> Summary:
@@ -109,6 +113,10 @@ def label_sequence(
         The file to write.
     settings
         Parameters of all steps.
+    sightings
+        What a camera saw of other things that move, see `docs/camera.md`.
+    taxonomy
+        Classes of the labels; those of the sequence unless given.
     force
         Replace `out` where it exists.
     executor
@@ -125,49 +133,61 @@ def label_sequence(
         If `out` cannot be written.
     """
     source, out, settings = Path(source), Path(out), settings or Settings()
-    inputs = input_files(source, map_yaml, annotation)
+    inputs = input_files(source, map_yaml, annotation, sightings)
     check_target(out, inputs.values(), force=force)
-    facts = salsa_facts(source, map_yaml, annotation, settings)
+    with SequenceReader(source) as reader:
+        header = reader.header
+    taxonomy = taxonomy or header.taxonomy
+    facts = salsa_facts(source, map_yaml, annotation, settings, sightings, taxonomy)
     files = [path.resolve() for path in (source, Path(map_yaml), Path(annotation))]
-    job = Job(files[0], files[1], files[2], settings, _digest(facts))
+    job = Job(files[0], files[1], files[2], sightings, taxonomy, settings, _digest(facts))
     prepared, run = prepare(job), executor or Serial()
     reader = prepared.reader
+    rough = rough_poses(reader, 0, len(reader))
     try:
-        check_inside(rough_poses(reader, 0, len(reader)), prepared.field)
-        provenance = dict(reader.header.provenance) | {"salsa": facts}
-        header = replace(reader.header, provenance=provenance)
+        check_inside(rough, prepared.field)
+        provenance = dict(header.provenance) | {"salsa": facts}
+        header = replace(header, taxonomy=taxonomy, provenance=provenance)
         with tqdm(total=2 * len(reader), desc=source.name, unit="scan", disable=None) as bar:
             found, near_before = _align_all(job, run, bar)
             found = _smoothed(job, found, run)
-            _check_fit(source, found, corrections(rough_poses(reader, 0, len(reader)), found.poses))
+            _check_fit(source, found, corrections(rough, found.poses), header)
             things = _find_things(job, found, run)
             with SequenceWriter(out, header) as writer:
                 counts = _write_all(job, writer, found, things, run, bar)
-                _copy_other_arrays(reader, writer)
+                copy_arrays(reader, writer, _others(reader))
                 writer.set_map(prepared.scene)
-        return _summarise(found, near_before, things, counts, reader.header.taxonomy)
+        return _summarise(found, near_before, things, counts, taxonomy)
     finally:
         reader.close()
 
 
-def input_files(source: Path, map_yaml: Path, annotation: Path) -> dict[str, Path]:
+def input_files(
+    source: Path, map_yaml: Path, annotation: Path, sightings: Sightings | None = None
+) -> dict[str, Path]:
     """Return every file that labelling reads, by its role.
 
     Raises
     ------
     FileNotFoundError, InvalidInputError
-        If the map's YAML file is missing, or names no image.
+        If the map's YAML file is missing, or names no image; or that of a camera.
     """
-    return {
+    files = {
         "sequence": Path(source),
         "map": Path(map_yaml),
         "map_image": map_image(map_yaml),
         "annotation": Path(annotation),
     }
+    return files | sighting_files(sightings)
 
 
 def salsa_facts(
-    source: Path, map_yaml: Path, annotation: Path, settings: Settings | None = None
+    source: Path,
+    map_yaml: Path,
+    annotation: Path,
+    settings: Settings | None = None,
+    sightings: Sightings | None = None,
+    taxonomy: Taxonomy | None = None,
 ) -> Facts:
     """Return what a labelling depends on: inputs with SHA-256, parameters, versions.
 
@@ -178,12 +198,17 @@ def salsa_facts(
     FileNotFoundError, InvalidInputError
         As `input_files`, and if another file is missing.
     """
-    inputs = input_files(source, map_yaml, annotation)
+    inputs = input_files(source, map_yaml, annotation, sightings)
+    parameters = asdict(settings or Settings()) | {"block_scans": BLOCK_SCANS}
+    if sightings is not None:
+        parameters |= {"detections": sightings.detections, "matching": asdict(sightings.matching)}
+    if taxonomy is not None:
+        parameters["taxonomy"] = asdict(taxonomy)
     facts = {
         "inputs": {
             role: {"name": path.name, "sha256": _sha256(path)} for role, path in inputs.items()
         },
-        "parameters": asdict(settings or Settings()) | {"block_scans": BLOCK_SCANS},
+        "parameters": parameters,
         "versions": {
             "semantic2d-dataset": semantic2d_dataset.__version__,
             "numpy": np.__version__,
@@ -269,8 +294,8 @@ def _find_things(job: Job, found: Alignment, run: Executor) -> Things:
     ledger = Ledger(coarse(field)[1])
     for evidence in run.map(partial(gather_block, job), _with_alignment(job, found)):
         ledger.add(evidence)
-    taxonomy = prepare(job).reader.header.taxonomy
-    return find_things(ledger, field, job.settings.transfer.object_m, persistence, taxonomy)
+    object_m = job.settings.transfer.object_m
+    return find_things(ledger, field, object_m, persistence, job.taxonomy)
 
 
 def _with_alignment(job: Job, found: Alignment) -> Iterable[Block]:
@@ -323,17 +348,15 @@ def _is_kept(name: str) -> bool:
     return name.startswith(_PER_SCAN_GROUPS) and name not in _OURS
 
 
-def _copy_other_arrays(reader: SequenceReader, writer: SequenceWriter) -> None:
-    """Copy what has rows of its own: streams, and fields of a published layout."""
-    for name in reader.names:
-        if name in _OURS or name.startswith(_OUR_GROUPS + _PER_SCAN_GROUPS):
-            continue
-        rows = reader.shape(name)[0]
-        for start in range(0, max(rows, 1), BLOCK_SCANS):
-            writer.append({name: reader.read(name, start, min(start + BLOCK_SCANS, rows))})
+def _others(reader: SequenceReader) -> list[str]:
+    """Return what has rows of its own: streams, and fields of a published layout."""
+    ours = _OUR_GROUPS + _PER_SCAN_GROUPS
+    return [name for name in reader.names if name not in _OURS and not name.startswith(ours)]
 
 
-def _check_fit(source: Path, found: Alignment, moved_m: NDArray[np.float64]) -> None:
+def _check_fit(
+    source: Path, found: Alignment, moved_m: NDArray[np.float64], header: SequenceHeader
+) -> None:
     """Refuse to call a recording from elsewhere a crowd."""
     known = np.isfinite(found.poses).all(axis=-1)
     if not known.any():
@@ -347,7 +370,8 @@ def _check_fit(source: Path, found: Alignment, moved_m: NDArray[np.float64]) -> 
             f"{source}: the scans do not fit the map: {found.accepted.sum()} of {known.sum()} "
             f"scans accepted; the median scan fits best {moved:.1f} m from its rough pose, with "
             f"{100 * near:.0f} % of its points near a mapped object; check that map, scan topic "
-            f"and mount belong together"
+            f"and mount belong together, and that the poses are in the frame of this map (they "
+            f"come from: {header.provenance.get('poses', 'the sequence')})"
         )
 
 

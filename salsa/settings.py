@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -12,7 +12,7 @@ from salsa.labelling import DEFAULT_TRANSFER, Transfer
 from salsa.smoothing import Smoothing
 from salsa.things import DEFAULT_PERSISTENCE, Persistence
 from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.scene.lines import PUBLISHED, LineParameters
+from semantic2d_dataset.scene.lines import FAST, LineParameters
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Settings:
     called Person then.
     """
 
-    lines: LineParameters = PUBLISHED
+    lines: LineParameters = FAST
     acceptance: Acceptance = TRUSTED
     smoothing: Smoothing | None = None
     persistence: Persistence | None = DEFAULT_PERSISTENCE
@@ -73,9 +73,9 @@ def _step(name: str, values: Any) -> Any:
             raise InvalidInputError(
                 f"salsa: {name}: {key}: expected a value like {known[key]!r}, found {value!r}"
             )
-    return kind(
-        **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-    )
+    start = getattr(Settings(), name) or kind()
+    changes = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
+    return replace(start, **changes)
 
 
 def _is_like(value: Any, example: Any) -> bool:

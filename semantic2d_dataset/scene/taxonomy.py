@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import InvalidInputError
@@ -96,6 +98,53 @@ class Taxonomy:
             if _plain(known) == wanted:
                 return i
         raise InvalidInputError(f"unknown class {name!r}; known are {', '.join(self.names)}")
+
+
+def read_taxonomy(path: Path) -> Taxonomy:
+    """Read classes from a YAML file.
+
+    ``classes`` maps names to colours ``[red, green, blue]`` in the order of their ids; with
+    ``extends: semantic2d`` they come after those of the release. ``background`` names the class
+    that collects everything else, the first one where it is left out.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    InvalidInputError
+        If it is not of that form.
+    """
+    try:
+        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (yaml.YAMLError, ValueError, RecursionError) as err:
+        raise InvalidInputError(f"{path}: not a YAML file: {err}") from err
+    keys = {"classes", "extends", "background"}
+    if not isinstance(found, dict) or not set(found) <= keys or "classes" not in found:
+        raise InvalidInputError(f"{path}: expected a mapping with `classes`, out of {sorted(keys)}")
+    base = SEMANTIC2D if found.get("extends") == "semantic2d" else None
+    if found.get("extends") is not None and base is None:
+        raise InvalidInputError(f"{path}: extends: expected semantic2d, found {found['extends']!r}")
+    classes = found["classes"]
+    if not isinstance(classes, dict) or not all(map(_is_colour, classes.values())):
+        raise InvalidInputError(
+            f"{path}: classes: expected names with a colour [red, green, blue] of 0 to 255 each, "
+            f"found {classes!r}"
+        )
+    names = (*(base.names if base else ()), *map(str, classes))
+    colours = (*(base.colours if base else ()), *((r, g, b) for r, g, b in classes.values()))
+    try:
+        made = Taxonomy(names, colours)
+        return replace(made, background_id=made.id_of(str(found.get("background", names[0]))))
+    except InvalidInputError as err:
+        raise InvalidInputError(f"{path}: {err}") from err
+
+
+def _is_colour(value: object) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 3
+        and all(type(part) is int and 0 <= part <= 255 for part in value)
+    )
 
 
 # Ids and colours as in the published release.

@@ -234,3 +234,10 @@ def test_labelmerc_is_written_once(tmp_path, monkeypatch):
     assert (tmp_path / ".labelmerc").read_text() == "mine"
     assert CliRunner().invoke(app, ["labelmerc", "--force"]).exit_code == 0
     assert (tmp_path / ".labelmerc").read_text() == labelmerc()
+
+
+def test_a_camera_and_its_detections_need_each_other(words):
+    for option in (["--camera", "camera.yaml"], ["--detections", "seen.json"]):
+        result = CliRunner().invoke(app, [*words, *option])
+        assert isinstance(result.exception, InvalidInputError)
+        assert "--camera and --detections need each other" in str(result.exception)

@@ -123,7 +123,7 @@ def test_a_stream_with_numbers_for_classes_takes_their_names(reader):
     found = read_detections("stream:old", reader, TAXONOMY, names={"18": "dog"})
     assert (found.class_ids.tolist(), found.boxes.tolist()) == ([DOG], [[10, 25, 30, 35]])
     with pytest.raises(InvalidInputError, match="stream:old: detected classes '18' are not known"):
-        read_detections("stream:old", reader, TAXONOMY, unknown="other")
+        read_detections("stream:old", reader, TAXONOMY)
 
 
 def test_a_stream_of_single_detections_is_read(reader):
@@ -180,11 +180,11 @@ def test_all_classes_that_are_not_known_are_listed_at_once(reader, tmp_path):
     assert "known are Other, Chair, Door" in str(told.value)
 
 
-def test_classes_can_be_other_another_or_nothing(reader, tmp_path):
-    content = classes("cat", "puppy", "handbag", "couch", "pedestrian")
+def test_classes_can_be_another_or_nothing(reader, tmp_path):
+    content = classes("puppy", "handbag", "couch", "pedestrian")
     names = {"puppy": "Dog", "handbag": None, "couch": "Sofa"}
-    found = read(content, reader, tmp_path, names=names, unknown="other")
-    assert found.class_ids.tolist() == [0, DOG, TAXONOMY.id_of("Sofa"), PERSON]
+    found = read(content, reader, tmp_path, names=names)
+    assert found.class_ids.tolist() == [DOG, TAXONOMY.id_of("Sofa"), PERSON]
     with pytest.raises(
         InvalidInputError, match="the class named for 'puppy': unknown class 'Wolf'"
     ):

@@ -1,4 +1,5 @@
 import hashlib
+import json
 
 import numpy as np
 import pytest
@@ -7,10 +8,11 @@ from salsa import blocks
 from salsa.alignment import Acceptance
 from salsa.sequences import label_sequence
 from salsa.settings import Settings
+from salsa.sightings import Sightings
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
 from semantic2d_dataset.executors import Processes
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
-from semantic2d_dataset.scene.taxonomy import UNLABELLED
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED, Taxonomy
 from tests.salsa import rooms
 
 SCANS = 70
@@ -216,3 +218,38 @@ def test_a_file_that_changed_is_read_anew(room, labelled, tmp_path):
         label_sequence(tmp_path / "in.h5", map_yaml, annotation, tmp_path / "out.h5", force=True)
         with SequenceReader(tmp_path / "out.h5") as reader:
             assert rooms.errors(reader.read("poses/refined"), poses)[0].max() < 0.05
+
+
+def write_camera(folder, stamps_ns, names=("dog",)):
+    """A camera that looks ahead, and one box over its whole image for each stamp."""
+    camera = {"width": 640, "height": 480, "fx": 200.0, "fy": 200.0, "cx": 320.0, "cy": 240.0}
+    camera["base_T_camera"] = [0.0, 0.0, 0.0, -np.pi / 2, 0.0, -np.pi / 2]
+    boxes = [{"box": [0, 0, 640, 480], "class": name} for name in names]
+    frames = [{"stamp_ns": int(stamp), "detections": boxes} for stamp in stamps_ns]
+    (folder / "camera.yaml").write_text(json.dumps(camera), encoding="utf-8")
+    (folder / "seen.json").write_text(json.dumps({"frames": frames}), encoding="utf-8")
+    return Sightings(folder / "camera.yaml", str(folder / "seen.json"))
+
+
+def test_what_a_camera_saw_takes_its_class(room, tmp_path):
+    _, map_yaml, annotation = room
+    poses = np.repeat(np.array(((4.5, 3.5, -0.9),)), 10, axis=0)
+    batch = rooms.batch_at(poses, poses, extra=[(5.3, 2.4, 5.5, 2.6)])
+    write_source(tmp_path / "in.h5", batch)
+    taxonomy = Taxonomy((*SEMANTIC2D.names, "Dog"), (*SEMANTIC2D.colours, (120, 80, 20)))
+    words = (tmp_path / "in.h5", map_yaml, annotation)
+    plain = label_sequence(*words, tmp_path / "plain.h5", taxonomy=taxonomy)
+    sightings = write_camera(tmp_path, batch.stamps_ns)
+    seen = label_sequence(*words, tmp_path / "seen.h5", taxonomy=taxonomy, sightings=sightings)
+    assert plain.points["Person"] > 50
+    assert (plain.points["Dog"], seen.points["Person"]) == (0, 0)
+    assert seen.points["Dog"] == plain.points["Person"]
+    with SequenceReader(tmp_path / "seen.h5") as reader:
+        assert reader.header.taxonomy == taxonomy
+        said = reader.header.provenance["salsa"]
+    assert {"camera", "detections"} <= set(said["inputs"])
+    with pytest.raises(InvalidInputError, match="detected classes 'dog' are not known"):
+        label_sequence(*words, tmp_path / "no.h5", sightings=sightings)
+    late = write_camera(tmp_path, batch.stamps_ns + 10**12)
+    with pytest.raises(InvalidInputError, match=r"no image lies within 0\.1 s of a scan"):
+        label_sequence(*words, tmp_path / "no.h5", sightings=late, taxonomy=taxonomy)
