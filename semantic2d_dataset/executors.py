@@ -22,6 +22,8 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
+from tqdm import tqdm
+
 from semantic2d_dataset.errors import InvalidInputError, WorkerLostError
 
 Item = TypeVar("Item")
@@ -251,6 +253,7 @@ class Processes(_Distributed):
 
 def _begin_worker(watched: Connection) -> None:
     threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
+    tqdm.set_lock(threading.RLock())  # its own spans processes, and is left behind by a sudden end
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     if "numba" in sys.modules:  # by a script that imports it at its top
         sys.modules["numba"].set_num_threads(1)
@@ -306,9 +309,13 @@ class Cluster(_Distributed):
         return self._client.submit(function, item, pure=False)
 
     def _first_done(self, waiting: list[_Task[Item, Result]]) -> _Task[Item, Result]:
+        from distributed import CancelledError
         from distributed import wait as wait_for
 
-        done = wait_for([task.future for task in waiting], return_when="FIRST_COMPLETED").done
+        try:
+            done = wait_for([task.future for task in waiting], return_when="FIRST_COMPLETED").done
+        except CancelledError:  # all of them: the scheduler is gone
+            return waiting[0]
         return next(task for task in waiting if task.future in done)
 
     def _result(self, task: _Task[Item, Result]) -> Result:
@@ -318,7 +325,8 @@ class Cluster(_Distributed):
         try:
             return task.future.result()  # type: ignore[no-any-return]
         except (KilledWorker, CancelledError, CommClosedError, ImportError) as err:
-            raise WorkerLostError(f"given up by the cluster: {err!r}") from err
+            why = " ".join(str(err).split()) or repr(err)
+            raise WorkerLostError(f"given up by the cluster: {why}") from err
 
 
 def open_executor(*, jobs: int = 1, scheduler: str | None = None) -> Executor:
