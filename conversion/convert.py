@@ -46,6 +46,7 @@ def convert_recording(
     options: Options | None = None,
     *,
     force: bool = False,
+    replace_outdated: bool = False,
     done: Done | None = None,
 ) -> tuple[Result, ...]:
     """Convert a recording of any kind into sequences.
@@ -64,7 +65,9 @@ def convert_recording(
     options
         What is not to be found from the recording.
     force
-        Whether files that exist are replaced.
+        Whether files that exist are replaced, complete or not.
+    replace_outdated
+        Whether files of another source, version or options are replaced, and only these.
     done
         What `out` holds already; looked up where None.
 
@@ -102,7 +105,8 @@ def convert_recording(
                 "as --out"
             )
         kept = () if force else done.files(key)
-        targets = _targets(out / SEQUENCES if with_lists else out, plans, kept, force=force)
+        may_replace = force or replace_outdated
+        targets = _targets(out / SEQUENCES if with_lists else out, plans, kept, force=may_replace)
         results = tuple(
             _kept(target) if target in kept else _write(target, plan, facts, len(plans))
             for target, plan in zip(targets, plans, strict=True)
@@ -110,6 +114,23 @@ def convert_recording(
         if with_lists:
             publish_with_lists(out, plans)
         return results
+
+
+def find_kept(
+    recording: Sequence[Path], out: Path, options: Options | None = None
+) -> tuple[Kept, ...]:
+    """Return the sequences that `convert_recording` would keep; none unless all are complete.
+
+    Raises
+    ------
+    FileNotFoundError, RecordingError
+        If there is no such recording, or it cannot be opened.
+    """
+    options = apply_preset(options or Options(), recording)
+    with open_source(recording, options) as source:
+        key = facts_of(source, options)["conversion"]
+    done = find_done(out)
+    return tuple(map(_kept, done.files(key))) if done.is_whole(key) else ()
 
 
 def _write(file: Path, plan: SequencePlan, facts: Facts, sequences: int) -> Summary:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,15 +26,18 @@ class Job:
     options: Options
     force: bool
     done: Done
+    replace_outdated: bool = False
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a recording: its sequences, or why there are none."""
+    """What became of a recording: its sequences, or why there are none; where, and how long."""
 
     recording: str
     results: tuple[Result, ...] = ()
     error: str | None = None
+    out: Path | None = None
+    seconds: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -107,16 +111,26 @@ def run(job: Job) -> Outcome:
     try:
         return _convert(job)
     except Semantic2DError as err:
-        return Outcome(name, error=str(err))
+        return Outcome(name, error=str(err), out=job.out)
     except OSError as err:
-        return Outcome(name, error=f"{err.filename or name}: {(err.strerror or str(err)).lower()}")
+        why = f"{err.filename or name}: {(err.strerror or str(err)).lower()}"
+        return Outcome(name, error=why, out=job.out)
 
 
 def _convert(job: Job) -> Outcome:
-    results = convert_recording(job.recording, job.out, job.options, force=job.force, done=job.done)
-    return Outcome(str(job.recording[0]), results)
+    began = time.monotonic()
+    results = convert_recording(
+        job.recording,
+        job.out,
+        job.options,
+        force=job.force,
+        replace_outdated=job.replace_outdated,
+        done=job.done,
+    )
+    seconds = time.monotonic() - began
+    return Outcome(str(job.recording[0]), results, out=job.out, seconds=seconds)
 
 
 def _lost(job: Job, error: WorkerLostError) -> Outcome:
     name = str(job.recording[0])
-    return Outcome(name, error=f"{name}: {error}")
+    return Outcome(name, error=f"{name}: {error}", out=job.out)

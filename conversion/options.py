@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 from conversion.messages.transforms import Mount
 from semantic2d_dataset.errors import InvalidInputError
@@ -93,3 +96,63 @@ class Options:
             raise InvalidInputError(
                 f"clock_offset_s: expected a number of seconds, found {self.clock_offset_s}"
             )
+
+
+def options_from(said: Mapping[str, Any]) -> Options:
+    """Return the options that plain values (of YAML or JSON) say, by their names.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no option of a name, or a value is not of its kind.
+    """
+    kinds = {field.name: str(field.type) for field in fields(Options)}
+    values = {}
+    for name, value in said.items():
+        if name not in kinds:
+            near = difflib.get_close_matches(str(name), kinds, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(kinds)}"
+            raise InvalidInputError(f"unknown option {name!r}; {hint}")
+        values[name] = _plain(name, kinds[name], value)
+    return Options(**values)
+
+
+def _plain(name: str, kind: str, value: Any) -> Any:
+    """Check a value by the annotation of its option, and make tuples of lists."""
+    if value is None and kind.endswith("| None"):
+        return None
+    expected, is_right, make = _KINDS[kind.removesuffix(" | None")]
+    if not is_right(value):
+        raise InvalidInputError(f"{name}: expected {expected}, found {value!r}")
+    return make(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _are_numbers(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(map(_is_number, value))
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(isinstance(each, str) for each in value)
+
+
+def _floats(value: Sequence[float]) -> tuple[float, ...]:
+    return tuple(map(float, value))
+
+
+_MOUNT = ("x", "y", "z", "roll", "pitch", "yaw")
+_KINDS: Mapping[str, tuple[str, Callable[[Any], bool], Callable[[Any], Any]]] = {
+    "bool": ("true or false", lambda value: isinstance(value, bool), bool),
+    "str": ("text", lambda value: isinstance(value, str), str),
+    "float": ("a number", _is_number, float),
+    "tuple[str, ...]": ("a list of texts", _are_texts, tuple),
+    "tuple[float, ...]": ("a list of numbers", _are_numbers, _floats),
+    "Mount": (
+        f"six numbers [{', '.join(_MOUNT)}]",
+        lambda value: _are_numbers(value) and len(value) == len(_MOUNT),
+        _floats,
+    ),
+}

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conversion.convert import Kept, convert_recording
+from conversion.convert import Kept, convert_recording, find_kept
 from conversion.messages.source import MessageSource
 from conversion.options import Options
 from conversion.ros.bags import Bag
@@ -214,3 +214,27 @@ def test_a_conversion_killed_at_any_point_leaves_a_right_file_or_none(tmp_path):
                 sequence.check_values()
                 assert len(sequence) == 6000
     convert_again(path, tmp_path / "out7")
+
+
+def test_only_what_is_outdated_is_replaced_where_that_is_asked_for(tmp_path):
+    path, out = two_lidars(tmp_path), tmp_path / "out"
+    convert_recording(path, out)
+    assert all(
+        isinstance(result, Kept) for result in convert_recording(path, out, replace_outdated=True)
+    )
+    options = Options(license="MIT")
+    results = convert_recording(path, out, options, replace_outdated=True)
+    assert all(isinstance(result, Summary) for result in results)
+    with SequenceReader(Path(results[0].file)) as sequence:
+        assert sequence.header.license == "MIT"
+
+
+def test_what_would_be_kept_is_told_and_nothing_is_made(tmp_path):
+    path, out = two_lidars(tmp_path), tmp_path / "out"
+    assert find_kept([path], out) == ()
+    assert not out.exists()
+    results = convert_recording(path, out)
+    assert [kept.file for kept in find_kept([path], out)] == [each.file for each in results]
+    assert find_kept([path], out, Options(license="MIT")) == ()
+    Path(results[0].file).unlink()
+    assert find_kept([path], out) == ()
