@@ -1,0 +1,337 @@
+"""What ``semantic2d run`` is told: recordings, maps and splits, in one YAML file."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import yaml
+
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.format.manifest import check_names
+from semantic2d_dataset.format.sequence import slug
+from semantic2d_dataset.pipeline.salsa_adapter import load_salsa
+from semantic2d_dataset.pipeline.siblings import load_sibling
+
+_FILE_OPTIONS = ("poses", "lidar")
+"""Options of the conversion that may name a file."""
+
+_KINDS = {
+    "string": "text",
+    "number": "a number",
+    "integer": "a whole number",
+    "object": "a mapping",
+    "array": "a list",
+}
+
+
+@dataclass(frozen=True)
+class RecordingConfig:
+    """One recording, and what is to become of it.
+
+    Parameters
+    ----------
+    paths
+        Its file or folder, or its several files.
+    environment, name
+        Parts of the ids of its sequences; the conversion adds to the name where a recording
+        becomes several.
+    map_yaml, annotation
+        The map, and its annotation.
+    convert
+        `conversion.options.Options`, checked.
+    salsa
+        `salsa.sequences.Settings`, checked.
+    drop
+        A list of scans that belong to no split, see `semantic2d_dataset.pipeline.drops`.
+    """
+
+    paths: tuple[Path, ...]
+    environment: str
+    name: str
+    map_yaml: Path
+    annotation: Path
+    convert: Any
+    salsa: Any
+    drop: Path | None
+
+    @property
+    def id(self) -> str:
+        """``<environment>--<recording>``, the start of the ids of its sequences."""
+        return f"{self.environment}--{self.name}"
+
+
+@dataclass(frozen=True)
+class Config:
+    """A data set to be made.
+
+    Parameters
+    ----------
+    path
+        The configuration file.
+    name, version, license
+        What the manifest says.
+    out
+        The data set's folder.
+    recordings
+        At least one.
+    splits
+        Parameters of each scheme by its name; None makes the standard ones.
+    """
+
+    path: Path
+    name: str
+    version: str
+    license: str
+    out: Path
+    recordings: tuple[RecordingConfig, ...]
+    splits: Mapping[str, Mapping[str, Any]] | None
+
+    def select(self, names: Collection[str]) -> tuple[RecordingConfig, ...]:
+        """Return the recordings of these names or ids; all where none is given.
+
+        Raises
+        ------
+        InvalidInputError
+            If there is none of a name.
+        """
+        known = {name for each in self.recordings for name in (each.id, each.name)}
+        for name in names:
+            if name not in known:
+                raise InvalidInputError(f"{self.path}: no recording {name!r}{_hint(name, known)}")
+        return tuple(
+            each for each in self.recordings if not names or {each.id, each.name} & {*names}
+        )
+
+
+def read_config(path: Path) -> Config:
+    """Read and check a configuration; paths in it are relative to its folder.
+
+    Raises
+    ------
+    FileNotFoundError
+        If it does not exist.
+    InvalidInputError
+        If it is not valid, or names files that do not exist.
+    """
+    path = Path(path).resolve()
+    said = _load(path)
+    problems = sorted(_problems(said))
+    if problems:
+        raise InvalidInputError(
+            f"{path}: {problems[0]}"
+            if len(problems) == 1
+            else f"{path}: {len(problems)} problems\n  - " + "\n  - ".join(problems)
+        )
+    try:
+        check_names(said["name"], said["version"])
+        recordings = tuple(
+            recording
+            for number, each in enumerate(said["recordings"])
+            for recording in _recordings(each, f"recordings[{number}]", said, path.parent)
+        )
+        _check_distinct(recordings)
+        _check_environments(said.get("splits", {}), {each.environment for each in recordings})
+    except InvalidInputError as err:
+        raise InvalidInputError(f"{path}: {err}") from err
+    return Config(
+        path=path,
+        name=said["name"],
+        version=said["version"],
+        license=said.get("license", "unknown"),
+        out=path.parent / Path(said["out"]).expanduser(),
+        recordings=recordings,
+        splits=said.get("splits"),
+    )
+
+
+def _load(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_bytes())
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as err:
+        raise InvalidInputError(f"{path}: not valid YAML: {' '.join(str(err).split())}") from err
+
+
+@cache
+def _schema() -> Any:
+    text = resources.files(__package__).joinpath("config.schema.json").read_text("utf-8")
+    return json.loads(text)
+
+
+def _problems(said: Any) -> Iterator[str]:
+    for error in jsonschema.Draft202012Validator(_schema()).iter_errors(said):
+        where = error.json_path.removeprefix("$").removeprefix(".")
+        yield from _in_words(f"{where}: " if where else "", error)
+
+
+def _in_words(where: str, error: Any) -> Iterator[str]:
+    """Say what was expected and what was found."""
+    schema, found = error.schema, error.instance
+    if error.validator == "additionalProperties":
+        known = schema["properties"]
+        for key in found:
+            if key not in known:
+                yield f"{where}unknown key {key!r}{_hint(str(key), known)}"
+    elif error.validator == "required":
+        key = next(key for key in error.validator_value if error.message.startswith(repr(key)))
+        yield f"{where}expected the key {key!r}, which is missing"
+    elif error.validator == "type":
+        quoted = f"; quote it: '{found}'" if error.validator_value == "string" else ""
+        is_plain = isinstance(found, int | float) and not isinstance(found, bool)
+        yield (
+            f"{where}expected {_KINDS[error.validator_value]}, found {found!r}"
+            f"{quoted if is_plain else ''}"
+        )
+    elif error.validator == "pattern":
+        yield (
+            f"{where}expected lower-case letters and digits with single '-', '.' or '_' between "
+            f"them, such as {slug(found)!r}; found {found!r}"
+        )
+    elif error.validator in ("minItems", "minProperties", "minLength"):
+        yield f"{where}is empty"
+    else:
+        yield f"{where}{error.message}"
+
+
+def _hint(word: str, known: Collection[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    return f"; known are {', '.join(sorted(known))}"
+
+
+def _recordings(
+    said: Mapping[str, Any], where: str, whole: Mapping[str, Any], folder: Path
+) -> Iterator[RecordingConfig]:
+    """Yield every recording that an entry names."""
+    maps = whole["maps"]
+    if said["map"] not in maps:
+        raise InvalidInputError(f"{where}.map: no map {said['map']!r}{_hint(said['map'], maps)}")
+    at, scene = f"maps.{said['map']}", maps[said["map"]]
+    environment = said.get("environment", slug(said["map"]))
+    found = _find(said, where, folder)
+    if "recording" in said and len(found) > 1:
+        raise InvalidInputError(
+            f"{where}.recording: {len(found)} recordings cannot share the name "
+            f"{said['recording']!r}; leave it out, or give each an entry of its own"
+        )
+    salsa = _settings(_merged(whole.get("salsa", {}), said.get("salsa", {})), f"{where}.salsa")
+    for paths in found:
+        yield RecordingConfig(
+            paths=paths,
+            environment=environment,
+            name=said.get("recording", _stem(paths[0])),
+            map_yaml=_file(scene["map"], f"{at}.map", folder),
+            annotation=_file(scene["annotation"], f"{at}.annotation", folder),
+            convert=_options(
+                _merged(whole.get("convert", {}), said.get("convert", {})),
+                f"{where}.convert",
+                folder,
+                environment=environment,
+                recording=said.get("recording"),
+                license=whole.get("license", "unknown"),
+            ),
+            salsa=salsa,
+            drop=_file(said["drop"], f"{where}.drop", folder) if "drop" in said else None,
+        )
+
+
+def _find(said: Mapping[str, Any], where: str, folder: Path) -> list[tuple[Path, ...]]:
+    if ("path" in said) == ("parts" in said):
+        raise InvalidInputError(
+            f"{where}: expected either 'path' (a recording, a folder of them or a pattern) or "
+            "'parts' (the files of one recording)"
+        )
+    if "parts" in said:
+        parts = enumerate(said["parts"])
+        return [tuple(_path(part, f"{where}.parts[{n}]", folder) for n, part in parts)]
+    place = folder / Path(said["path"]).expanduser()
+    top = Path(place.anchor)
+    paths = [place] if place.exists() else sorted(top.glob(str(place.relative_to(top))))
+    if not paths:
+        raise InvalidInputError(f"{where}.path: nothing is at {place}")
+    found = load_sibling("conversion", "sources").find_recordings(paths)
+    return [tuple(each) for each in found]
+
+
+def _path(text: str, where: str, folder: Path) -> Path:
+    path = folder / Path(text).expanduser()
+    if not path.exists():
+        raise InvalidInputError(f"{where}: nothing is at {path}")
+    return path
+
+
+def _file(text: str, where: str, folder: Path) -> Path:
+    path = _path(text, where, folder)
+    if not path.is_file():
+        raise InvalidInputError(f"{where}: expected a file, found the folder {path}")
+    return path
+
+
+def _stem(path: Path) -> str:
+    """Name a recording as the conversion does."""
+    return slug(path.name if path.is_dir() else path.name.split(".")[0] or path.name)
+
+
+def _options(said: Mapping[str, Any], where: str, folder: Path, **given: Any) -> Any:
+    said = {
+        key: str(folder / value)
+        if key in _FILE_OPTIONS and isinstance(value, str) and (folder / value).is_file()
+        else value
+        for key, value in said.items()
+    }
+    twice = sorted(given.keys() & said.keys())
+    if twice:
+        raise InvalidInputError(f"{where}: {twice[0]!r} does not belong here, but one level up")
+    try:
+        return load_sibling("conversion", "options").options_from({**said, **given})
+    except InvalidInputError as err:
+        raise InvalidInputError(f"{where}: {err}") from err
+
+
+def _settings(said: Mapping[str, Any], where: str) -> Any:
+    try:
+        return load_salsa().settings_from(said)
+    except InvalidInputError as err:
+        raise InvalidInputError(f"{where}: {str(err).removeprefix('salsa: ')}") from err
+
+
+def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is said of all, with what is said of one in its place, key by key."""
+    merged = dict(base)
+    for key, value in own.items():
+        both = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
+        merged[key] = _merged(base[key], value) if both else value
+    return merged
+
+
+def _check_distinct(recordings: Collection[RecordingConfig]) -> None:
+    seen: dict[str, RecordingConfig] = {}
+    for each in recordings:
+        twin = seen.setdefault(each.id, each)
+        if twin is not each:
+            raise InvalidInputError(
+                f"{twin.paths[0]} and {each.paths[0]} are both {each.id}; give them names with "
+                "'recording', or other environments"
+            )
+
+
+def _check_environments(splits: Mapping[str, Any], environments: Collection[str]) -> None:
+    for split, names in splits.get("environment", {}).items():
+        for name in names:
+            if name not in environments:
+                raise InvalidInputError(
+                    f"splits.environment.{split}: no environment {name!r}"
+                    f"{_hint(name, environments)}"
+                )
+    if "environment" in splits and len(environments) < 3:
+        raise InvalidInputError(
+            f"splits.environment: needs 3 environments, found {', '.join(sorted(environments))}"
+        )
