@@ -137,8 +137,8 @@ def label_sequence(
     check_target(out, inputs.values(), force=force)
     with SequenceReader(source) as reader:
         header = reader.header
-    taxonomy = taxonomy or header.taxonomy
     facts = salsa_facts(source, map_yaml, annotation, settings, sightings, taxonomy)
+    taxonomy = taxonomy or header.taxonomy
     files = [path.resolve() for path in (source, Path(map_yaml), Path(annotation))]
     job = Job(files[0], files[1], files[2], sightings, taxonomy, settings, _digest(facts))
     prepared, run = prepare(job), executor or Serial()

@@ -6,19 +6,17 @@ commands of the sibling packages are looked up by name when they are called.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import semantic2d_dataset
 from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
+from semantic2d_dataset.pipeline.siblings import load_sibling
 
 if TYPE_CHECKING:
     from semantic2d_dataset.access.registry import OpenDataset
@@ -247,6 +245,49 @@ def view(
     typer.echo(f"{'showing' if save is None else f'wrote {save}:'} {shown} scans")
 
 
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="YAML file: recordings, maps and splits.")],
+    *,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes to use.")] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Dask scheduler (tcp://host:8786) whose workers see the same files."),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="A recording to convert and label; nothing is published then."),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a data set: convert recordings, label them, publish them with splits.
+
+    Run it again after an interruption or a change: what is done already, from the same files
+    and settings, is kept. A recording that fails stops no other; nothing is published then.
+    """
+    from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.pipeline.config import read_config
+    from semantic2d_dataset.pipeline.steps import plan_pipeline, run_pipeline
+
+    said = read_config(config)
+    if dry_run:
+        plan = plan_pipeline(said, only=only or ())
+        for each in plan if not as_json else ():
+            what = each["error"] or ", ".join(each["steps"]) or "kept"
+            typer.echo(f"{each['recording']}: {what}", err=each["error"] is not None)
+        if as_json:
+            typer.echo(json.dumps(plan, indent=1))
+        raise typer.Exit(int(any(each["error"] for each in plan)))
+    with open_executor(jobs=jobs, scheduler=scheduler) as executor:
+        report = run_pipeline(said, executor, only=only or ())
+    typer.echo(json.dumps(report.as_dict(), indent=1) if as_json else str(report))
+    if report.failed:
+        raise typer.Exit(1)
+
+
 @app.command(context_settings=_FORWARDED, add_help_option=False)
 def inspect(context: typer.Context) -> None:
     """Say what a recording holds, and how it would be converted."""
@@ -287,31 +328,6 @@ def baseline(context: typer.Context) -> None:
 def leaderboard(context: typer.Context) -> None:
     """Rank results."""
     _forward(load_sibling("leaderboard").app, "leaderboard", context.args)
-
-
-def load_sibling(package: str) -> ModuleType:
-    """Import the commands of a package that is installed beside this one.
-
-    Raises
-    ------
-    InvalidInputError
-        If another package of that name comes first on the import path.
-    """
-    expected = Path(semantic2d_dataset.__file__).resolve().parents[1] / package
-    spec = importlib.util.find_spec(package)
-    if spec is None:
-        raise InvalidInputError(
-            f"the package {package!r} of semantic2d-dataset is not there (expected at {expected}); "
-            "install semantic2d-dataset again"
-        )
-    origin = Path(spec.origin).resolve().parent if spec.origin else None
-    if origin != expected:
-        raise InvalidInputError(
-            f"the package {package!r} of semantic2d-dataset is {expected}, but Python finds "
-            f"{origin or 'another one'} first; run from another folder, rename or uninstall "
-            "that one, or take it off PYTHONPATH"
-        )
-    return importlib.import_module(f"{package}.cli")
 
 
 def _forward_conversion(name: str, words: Sequence[str]) -> None:

@@ -11,7 +11,6 @@ import time
 import pytest
 
 from semantic2d_dataset import __version__, cli
-from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.manifest import read_manifest
 from tests.conftest import PROJECT
 from tests.generators import make_sequence
@@ -49,6 +48,7 @@ def test_help_lists_every_command(run):
         "report",
         "plot",
         "view",
+        "run",
         "convert",
         "salsa",
         "baseline",
@@ -75,6 +75,8 @@ def test_commands_of_siblings_have_help(words, run):
         ["simulate", "x", "--scans", "many"],
         ["simulate", "x", "--scans", "0"],
         ["simulate", "x", "--seed", "-1"],
+        ["run"],
+        ["run", "x", "--jobs", "0"],
         ["convert"],
         ["salsa", "nothing"],
         ["salsa", "label"],
@@ -134,6 +136,7 @@ COMMANDS = {
     "train": ["baseline", "train", "s3net", "--data", "{bad}", "--out", "{out}"],
     "predict": ["baseline", "predict", "{bad}", "--out", "{out}"],
     "leaderboard": ["leaderboard", "table", "{bad}"],
+    "run": ["run", "{bad}"],
 }
 
 
@@ -254,16 +257,6 @@ def test_view_without_its_extra_says_how_to_get_it(run, tmp_path, monkeypatch):
     assert "pip install 'semantic2d-dataset[view]'" in err
     status, _, err = run("view", tmp_path / "a.h5", "--save", tmp_path / "a.h5")
     assert (status, "is the input itself" in err) == (1, True)
-
-
-def test_shadowing_package_is_named_with_a_way_out(tmp_path, monkeypatch):
-    (tmp_path / "conversion").mkdir()
-    (tmp_path / "conversion" / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "conversion", raising=False)
-    monkeypatch.delitem(sys.modules, "conversion.cli", raising=False)
-    with pytest.raises(InvalidInputError, match=f"Python finds {tmp_path}/conversion first"):
-        cli.load_sibling("conversion")
 
 
 def test_shadowing_does_not_stop_other_commands(tmp_path):

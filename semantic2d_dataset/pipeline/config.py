@@ -17,7 +17,6 @@ import yaml
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.manifest import check_names
 from semantic2d_dataset.format.sequence import slug
-from semantic2d_dataset.pipeline.salsa_adapter import load_salsa
 from semantic2d_dataset.pipeline.siblings import load_sibling
 
 _FILE_OPTIONS = ("poses", "lidar")
@@ -298,7 +297,7 @@ def _options(said: Mapping[str, Any], where: str, folder: Path, **given: Any) ->
 
 def _settings(said: Mapping[str, Any], where: str) -> Any:
     try:
-        return load_salsa().settings_from(said)
+        return load_sibling("salsa", "settings").settings_from(said)
     except InvalidInputError as err:
         raise InvalidInputError(f"{where}: {str(err).removeprefix('salsa: ')}") from err
 
