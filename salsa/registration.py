@@ -9,6 +9,7 @@ is looked up together lying together.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -19,6 +20,7 @@ from semantic2d_dataset.scene.scans import ScanBatch
 
 Float = NDArray[np.float64]
 Surface = NDArray[np.float32]
+Seen = NDArray[np.float32]
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # sums need not keep their order
 
 FIRST_SCALE_M, LAST_SCALE_M = 0.5, 0.1  # finer than 0.1 m is worse where the world has changed
@@ -36,6 +38,19 @@ SEARCH_SCALE_M = 0.2
 CANDIDATES = 5
 HIGH_COST = 0.4  # of a refined pose, above which the neighbourhood is searched
 WORSE_COST = 0.02  # than the neighbour's, above which its pose is tried; noise moves a cost less
+
+
+class Normals(NamedTuple):
+    """Normal equations of weighted distances d with Geman-McClure weights w.
+
+    `hessian` (3, 3), `gradient` (3,), `squares` the sum of w d^2, `weights` the sum of w.
+    """
+
+    hessian: Float
+    gradient: Float
+    squares: float
+    weights: float
+
 
 Beams = tuple[NDArray[np.float32], NDArray[np.bool_], Float, Float]
 """What the kernels take of N scans: ranges (N, B), which to use (N, B), directions (B, 2) of the
@@ -94,56 +109,101 @@ def robust_cost(
 
 
 @numba.njit(cache=True, fastmath=_FAST)
-def normal_equations(
-    points: Float, stride: int, pose: Float, surface: Surface, resolution: float, scale: float
-) -> tuple[Float, Float, float, float]:
-    """Linearise the weighted distances at a pose.
+def look_up(
+    points: Float, stride: int, pose: Float, surface: Surface, resolution: float, seen: Seen
+) -> int:
+    """Write distance, its slopes by x and y, and by yaw, of the points on the map into `seen`.
 
-    Returns
-    -------
-    hessian, gradient, weighted_squares, weights
-        (3, 3), (3,), sum of w d^2, sum of w, with Geman-McClure weights w. Points beyond the map
-        take no part.
+    Slopes are in m a cell; returns how many points they are. Kept apart from `weigh`, so that the
+    sums there run over what lies side by side.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     per_m = 1.0 / resolution
     u0, v0 = pose[0] * per_m - 0.5, pose[1] * per_m - 0.5
     rows, columns = surface.shape[:2]
-    g0, g1, g2, squares, weights = 0.0, 0.0, 0.0, 0.0, 0.0
-    h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    count = 0
     for k in range(0, len(points), stride):
         dx = cos * points[k, 0] - sin * points[k, 1]
         dy = sin * points[k, 0] + cos * points[k, 1]
         u, v = u0 + dx * per_m, v0 + dy * per_m
         if u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1:
             column, row = int(u), int(v)
-            fu, fv = u - column, v - row
+            fu, fv = np.float32(u - column), np.float32(v - row)
             d, du, dv, duv = surface[row, column]
             gx, gy = du + duv * fv, dv + duv * fu
-            d += du * fu + gy * fv
-            gt = gy * dx - gx * dy
-            share = scale * scale / (scale * scale + d * d)
-            w = share * share
-            wx, wy, wt = w * gx, w * gy, w * gt
-            h00, h01, h02 = h00 + wx * gx, h01 + wx * gy, h02 + wx * gt
-            h11, h12, h22 = h11 + wy * gy, h12 + wy * gt, h22 + wt * gt
-            g0, g1, g2 = g0 + wx * d, g1 + wy * d, g2 + wt * d
-            squares += w * d * d
-            weights += w
-    hessian = np.array(((h00, h01, h02), (h01, h11, h12), (h02, h12, h22))) * (per_m * per_m)
-    return hessian, np.array((g0, g1, g2)) * per_m, squares, weights
+            seen[0, count] = d + du * fu + gy * fv
+            seen[1, count], seen[2, count] = gx, gy
+            seen[3, count] = gy * np.float32(dx) - gx * np.float32(dy)
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, fastmath=_FAST)
+def weigh(seen: Seen, count: int, resolution: float, scale: float) -> Normals:
+    """Sum up the normal equations of the points that `look_up` found."""
+    zero, scale2 = np.float32(0.0), np.float32(scale * scale)
+    g0, g1, g2, squares, weights = zero, zero, zero, zero, zero
+    h00, h01, h02, h11, h12, h22 = zero, zero, zero, zero, zero, zero
+    for k in range(count):
+        d, gx, gy, gt = seen[0, k], seen[1, k], seen[2, k], seen[3, k]
+        share = scale2 / (scale2 + d * d)
+        w = share * share
+        wx, wy, wt, wd = w * gx, w * gy, w * gt, w * d
+        h00, h01, h02 = h00 + wx * gx, h01 + wx * gy, h02 + wx * gt
+        h11, h12, h22 = h11 + wy * gy, h12 + wy * gt, h22 + wt * gt
+        g0, g1, g2 = g0 + wd * gx, g1 + wd * gy, g2 + wd * gt
+        squares += wd * d
+        weights += w
+    per_m = 1.0 / resolution
+    hessian = np.array(((h00, h01, h02), (h01, h11, h12), (h02, h12, h22)), np.float64)
+    gradient = np.array((g0, g1, g2), np.float64)
+    return Normals(
+        hessian * (per_m * per_m), gradient * per_m, np.float64(squares), np.float64(weights)
+    )
+
+
+@numba.njit(cache=True, fastmath=_FAST)
+def fit_quality(seen: Seen, count: int, points: int, inlier_m: float) -> tuple[float, float]:
+    """Return the rms distance of the inliers (m), and their share of all points."""
+    limit, squares, inliers = np.float32(inlier_m), np.float32(0.0), 0
+    for k in range(count):
+        d = seen[0, k]
+        near = d <= limit
+        inliers += near
+        squares += d * d * near
+    if inliers == 0:
+        return math.inf, 0.0
+    return math.sqrt(squares / inliers), inliers / points
+
+
+@numba.njit(cache=True, fastmath=_FAST)
+def cost_of(seen: Seen, count: int, points: int, scale: float) -> float:
+    """Return the mean Geman-McClure cost 0..1; a point outside the map costs 1."""
+    total, scale2 = np.float32(0.0), np.float32(scale * scale)
+    for k in range(count):
+        d2 = seen[0, k] * seen[0, k]
+        total += d2 / (d2 + scale2)
+    return float(total + (points - count)) / max(points, 1)
 
 
 @numba.njit(cache=True)
 def refine(
     points: Float, start: Float, surface: Surface, resolution: float, first_scale: float
-) -> Float:
-    """Move a pose so that the points lie on the map: Gauss-Newton with a shrinking robust scale."""
+) -> tuple[Float, float]:
+    """Move a pose so that the points lie on the map: Gauss-Newton with a shrinking robust scale.
+
+    Returns
+    -------
+    pose, cost
+        (3,), and its cost at the last scale.
+    """
+    seen = np.empty((4, len(points)), np.float32)
     pose, scale, fine = start.copy(), first_scale, 0
     for _ in range(MAX_STEPS):
         stride = max(len(points) // (COARSE_POINTS if fine == 0 else FINE_POINTS), 1)
-        h, g, _squares, weights = normal_equations(points, stride, pose, surface, resolution, scale)
-        step = solve(h, g, 1e-3 * weights + 1e-9)
+        count = look_up(points, stride, pose, surface, resolution, seen)
+        found = weigh(seen, count, resolution, scale)
+        step = solve(found.hessian, found.gradient, 1e-3 * found.weights + 1e-9)
         pose -= step
         if scale <= LAST_SCALE_M:
             done = abs(step[0]) < STEP_M and abs(step[1]) < STEP_M and abs(step[2]) < STEP_RAD
@@ -151,7 +211,8 @@ def refine(
                 break
             fine += done or fine > 0
         scale = max(scale * SHRINK, LAST_SCALE_M)
-    return pose
+    count = look_up(points, 1, pose, surface, resolution, seen)
+    return pose, cost_of(seen, count, len(points), LAST_SCALE_M)
 
 
 @numba.njit(cache=True)
@@ -173,8 +234,10 @@ def solve(h: Float, g: Float, damping: float) -> Float:
 
 
 @numba.njit(cache=True)
-def search(points: Float, centre: Float, surface: Surface, resolution: float) -> Float:
-    """Score a lattice of poses around a centre, refine the best few and return the best of them."""
+def search(
+    points: Float, centre: Float, surface: Surface, resolution: float
+) -> tuple[Float, float]:
+    """Score a lattice of poses around a centre, refine the best few; best pose and its cost."""
     stride = max(len(points) // SEARCH_POINTS, 1)
     best_costs = np.full(CANDIDATES, np.inf)
     best_poses = np.zeros((CANDIDATES, 3))
@@ -192,11 +255,10 @@ def search(points: Float, centre: Float, surface: Surface, resolution: float) ->
                     best_poses[worst] = pose
     best, lowest = centre.copy(), np.inf
     for m in range(CANDIDATES):
-        pose = refine(points, best_poses[m], surface, resolution, FIRST_SCALE_M / 2)
-        cost = robust_cost(points, 1, pose, surface, resolution, LAST_SCALE_M)
+        pose, cost = refine(points, best_poses[m], surface, resolution, FIRST_SCALE_M / 2)
         if cost < lowest:
             best, lowest = pose, cost
-    return best
+    return best, lowest
 
 
 @numba.njit(cache=True, parallel=True)
@@ -234,11 +296,9 @@ def register(
     points: Float, start: Float, surface: Surface, resolution: float
 ) -> tuple[Float, float]:
     """Refine a start, and search around it where the cost stays high."""
-    pose = refine(points, start, surface, resolution, FIRST_SCALE_M)
-    cost = robust_cost(points, 1, pose, surface, resolution, LAST_SCALE_M)
+    pose, cost = refine(points, start, surface, resolution, FIRST_SCALE_M)
     if cost > HIGH_COST:
-        other = search(points, start, surface, resolution)
-        other_cost = robust_cost(points, 1, other, surface, resolution, LAST_SCALE_M)
+        other, other_cost = search(points, start, surface, resolution)
         if other_cost < cost:
             return other, other_cost
     return pose, cost
@@ -309,8 +369,9 @@ def fit_each(
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
         if len(points) > 0 and np.isfinite(poses[n, 0]):
-            quality = fit_quality(points, poses[n], surface, resolution, inlier_m)
-            residual_m[n], inlier_ratio[n] = quality
+            seen = np.empty((4, len(points)), np.float32)
+            count = look_up(points, 1, poses[n], surface, resolution, seen)
+            residual_m[n], inlier_ratio[n] = fit_quality(seen, count, len(points), inlier_m)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -331,46 +392,26 @@ def measure_each(
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
         if len(points) > 0 and np.isfinite(poses[n, 0]):
-            quality = fit_quality(points, poses[n], surface, resolution, inlier_m)
-            residual_m[n], inlier_ratio[n] = quality
-            pose_covariance(points, poses[n], surface, resolution, covariance[n])
+            seen = np.empty((4, len(points)), np.float32)
+            count = look_up(points, 1, poses[n], surface, resolution, seen)
+            residual_m[n], inlier_ratio[n] = fit_quality(seen, count, len(points), inlier_m)
+            found = weigh(seen, count, resolution, LAST_SCALE_M)
+            set_covariance(found, resolution, covariance[n])
 
 
 @numba.njit(cache=True)
-def fit_quality(
-    points: Float, pose: Float, surface: Surface, resolution: float, inlier_m: float
-) -> tuple[float, float]:
-    """Return the rms distance of the points within `inlier_m` of the map (m), and their share."""
-    c, s = math.cos(pose[2]) / resolution, math.sin(pose[2]) / resolution
-    u0, v0 = pose[0] / resolution - 0.5, pose[1] / resolution - 0.5
-    squares, count = 0.0, 0
-    for k in range(len(points)):
-        u = u0 + c * points[k, 0] - s * points[k, 1]
-        distance = distance_at(u, v0 + s * points[k, 0] + c * points[k, 1], surface)
-        if 0.0 <= distance <= inlier_m:
-            squares += distance * distance
-            count += 1
-    if count == 0:
-        return math.inf, 0.0
-    return math.sqrt(squares / count), count / len(points)
-
-
-@numba.njit(cache=True)
-def pose_covariance(
-    points: Float, pose: Float, surface: Surface, resolution: float, out: Float
-) -> None:
+def set_covariance(found: Normals, resolution: float, out: Float) -> None:
     """Write the covariance (3, 3) of a pose, from the normal equations at the last scale.
 
     The variance of a distance is that of the weighted residuals, and never below that of a point
     spread evenly over one cell.
     """
-    h, _g, squares, weights = normal_equations(points, 1, pose, surface, resolution, LAST_SCALE_M)
-    variance = max(squares / max(weights, 1e-9), resolution * resolution / 12.0)
+    variance = max(found.squares / max(found.weights, 1e-9), resolution * resolution / 12.0)
     unit = np.zeros(3)
     for k in range(3):
         unit[:] = 0.0
         unit[k] = variance
-        column = solve(h, unit, 1e-6)
+        column = solve(found.hessian, unit, 1e-6)
         for m in range(3):
             out[m, k] = column[m]
     for k in range(3):  # exactly symmetric, whatever was rounded
