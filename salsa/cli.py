@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -40,14 +40,17 @@ def label(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON for a program to read.")
     ] = False,
+    settings: Annotated[
+        Path | None, typer.Option(help="Parameters of all steps (YAML), see docs/salsa.md.")
+    ] = None,
     static_after: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=0,
             help="Take what is seen to stay in free space for this many seconds, and has no legs, "
-            "for a thing and not a person; 0 calls all of it Person.",
+            "for a thing and not a person (5 if not given); 0 calls all of it Person.",
         ),
-    ] = 5,
+    ] = None,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Let poses agree with the motion from scan to scan.")
     ] = False,
@@ -86,11 +89,8 @@ def label(
     ] = None,
 ) -> None:
     """Align a sequence with its map and write a labelled copy."""
-    from salsa.labelling import Transfer
     from salsa.sequences import check_target, input_files, label_sequence
-    from salsa.settings import Settings
-    from salsa.smoothing import Smoothing
-    from salsa.things import Persistence
+    from salsa.settings import read_settings
     from semantic2d_dataset.executors import open_executor
     from semantic2d_dataset.scene.taxonomy import read_taxonomy
 
@@ -100,11 +100,13 @@ def label(
         check_picture_name(plot)
         inputs = input_files(sequence, map_yaml, annotation).values()
         check_target(plot, (*inputs, out), force=force)
-    settings = Settings(
-        smoothing=Smoothing(odometry=odometry) if smooth or odometry else None,
-        persistence=Persistence(min_seconds=static_after) if static_after else None,
-        transfer=Transfer(ignore_no_return=ignore_no_return),
-    )
+    changes: dict[str, Any] = {}
+    if static_after is not None:
+        changes["persistence"] = {"min_seconds": static_after} if static_after else None
+    if smooth or odometry:
+        changes["smoothing"] = {"odometry": odometry} if odometry else {}
+    if ignore_no_return:
+        changes["transfer"] = {"ignore_no_return": True}
     sightings = _sightings(camera, detections, detection_names, camera_clock_offset)
     with open_executor(jobs=jobs, scheduler=scheduler) as executor:
         summary = label_sequence(
@@ -112,7 +114,7 @@ def label(
             map_yaml,
             annotation,
             out,
-            settings=settings,
+            settings=read_settings(settings, changes),
             sightings=sightings,
             taxonomy=None if taxonomy is None else read_taxonomy(taxonomy),
             force=force,

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
+
+import yaml
 
 from salsa.alignment import TRUSTED, Acceptance
 from salsa.labelling import DEFAULT_TRANSFER, Transfer
@@ -28,6 +31,38 @@ class Settings:
     smoothing: Smoothing | None = None
     persistence: Persistence | None = DEFAULT_PERSISTENCE
     transfer: Transfer = DEFAULT_TRANSFER
+
+
+def read_settings(path: Path | None, changes: Mapping[str, Any]) -> Settings:
+    """Read settings from a YAML file, the defaults where there is none, and change some of them.
+
+    Parameters
+    ----------
+    path
+        The file, as `settings_from` takes its content.
+    changes
+        By step; each is merged into what the file says of it.
+
+    Raises
+    ------
+    FileNotFoundError, InvalidInputError
+        If the file is missing, or names what there is not.
+    """
+    said: Any = {}
+    if path is not None:
+        try:
+            said = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        except (yaml.YAMLError, ValueError, RecursionError) as err:
+            raise InvalidInputError(f"{path}: not a YAML file: {err}") from err
+        if not isinstance(said, dict):
+            raise InvalidInputError(f"{path}: expected a mapping of steps to parameters")
+    for step, change in changes.items():
+        both = isinstance(change, Mapping) and isinstance(said.get(step), Mapping)
+        said[step] = {**said[step], **change} if both else change
+    try:
+        return settings_from(said)
+    except InvalidInputError as err:
+        raise InvalidInputError(f"{path}: {err}" if path else str(err)) from err
 
 
 _STEPS: dict[str, type] = {

@@ -1,6 +1,6 @@
 import pytest
 
-from salsa.settings import Settings, settings_from
+from salsa.settings import Settings, read_settings, settings_from
 from salsa.things import Persistence
 from semantic2d_dataset.errors import InvalidInputError
 
@@ -39,3 +39,28 @@ def test_what_is_said_takes_the_place_of_the_default():
 def test_what_cannot_be_is_refused_by_its_name(values, message):
     with pytest.raises(InvalidInputError, match=message):
         settings_from(values)
+
+
+def test_a_file_is_changed_by_what_is_said_beside_it(tmp_path):
+    file = tmp_path / "salsa.yaml"
+    file.write_text("persistence: {moved_m: 2.0}\nacceptance: {max_correction_m: 4}", "utf-8")
+    found = read_settings(file, {"persistence": {"min_seconds": 9}, "smoothing": {}})
+    assert found.persistence == Persistence(min_seconds=9, moved_m=2.0)
+    assert found.acceptance.max_correction_m == 4
+    assert found.smoothing is not None
+    assert read_settings(file, {"persistence": None}).persistence is None
+    assert read_settings(None, {}) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[1]", "salsa.yaml: expected a mapping"),
+        ("a: [", "salsa.yaml: not a YAML file"),
+        ("lines: {gap: 1}", "salsa.yaml: salsa: lines: unknown key 'gap'"),
+    ],
+)
+def test_a_file_that_cannot_be_understood_is_named(text, message, tmp_path):
+    (tmp_path / "salsa.yaml").write_text(text, "utf-8")
+    with pytest.raises(InvalidInputError, match=message):
+        read_settings(tmp_path / "salsa.yaml", {})
