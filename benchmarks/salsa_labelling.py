@@ -168,7 +168,7 @@ def bare_corridor(length: float = 160.0, width: float = 2.4) -> World:
 def published_lobby(folder: Path, seed: int) -> Place:
     """Stand a world on the published map; the robot visits places 0.6 m clear of everything."""
     scene = annotate_map(folder / "map.yaml", folder / "label.png")
-    image = read_annotation(folder / "label.png", scene.occupancy.shape)
+    image = read_annotation(folder / "label.png", scene.occupancy.shape).regions
     clearance = ndimage.distance_transform_edt(scene.occupancy == FREE) * scene.resolution
     regions, _count = ndimage.label(clearance > 0.6)
     largest = 1 + np.argmax(np.bincount(regions.ravel())[1:])

@@ -31,8 +31,8 @@ class Outline:
 def find_standing(outlines: list[Outline]) -> NDArray[np.bool_]:
     """Tell which outlines (K,) are legs of somebody who stands.
 
-    Two outlines that are a leg each, side by side, are a person, and so is one that falls into
-    two such legs.
+    Two outlines that are a leg each, side by side, are a person. So is one that falls into two
+    parts, one of them a leg and the other as small as one: what is seen between legs blurs them.
     """
     pairs = [_is_pair(*_halves(outline)) for outline in outlines]
     standing = np.array(pairs, np.bool_)
@@ -102,5 +102,20 @@ def _halves(outline: Outline) -> tuple[Outline, Outline]:
 
 
 def _is_pair(first: Outline, second: Outline) -> bool:
-    gap = np.hypot(*(_leg(first) - _leg(second)))
-    return bool(GAP_M[0] <= gap <= GAP_M[1])  # NaN is not
+    if not (len(first.points) and len(second.points)):
+        return False
+    legs = _leg(first), _leg(second)
+    middles = [
+        leg if np.isfinite(leg).all() else _middle_of_small(part)
+        for leg, part in zip(legs, (first, second), strict=True)
+    ]
+    gap = np.hypot(*(middles[0] - middles[1]))
+    return bool(np.isfinite(legs).all(axis=-1).any() and GAP_M[0] <= gap <= GAP_M[1])
+
+
+def _middle_of_small(outline: Outline) -> Float:
+    """Return the middle (2,) of an outline no larger than a leg, NaN of any other."""
+    if np.ptp(principal_axis(outline)) > 2 * RADIUS_M[1]:
+        return np.full(2, np.nan)
+    middle: Float = np.average(outline.points, axis=0, weights=outline.weights)
+    return middle

@@ -114,8 +114,9 @@ def check_plan(name: str) -> None:
 def world_from_map(name: str, scene_map: SemanticMap, tour: Float) -> World:
     """Build a world whose solid things are the occupied cells of a map.
 
-    Each edge between an occupied and another cell becomes a segment of the cell's class; cells
-    without one are walls. Cells of one class that touch each other are one object.
+    Each edge between an occupied and another cell becomes a segment of the cell's class. Cells
+    without one are Other, as labelling calls them; walls where no cell has a class. Cells of one
+    class that touch each other are one object.
 
     Parameters
     ----------
@@ -123,7 +124,8 @@ def world_from_map(name: str, scene_map: SemanticMap, tour: Float) -> World:
         (K, 2) f8, m, map frame: places in free space that a robot visits.
     """
     segments, cells = _cell_edges(scene_map)
-    labels = np.where(scene_map.labels == UNLABELLED, WALL, scene_map.labels)
+    unlabelled = scene_map.labels == UNLABELLED
+    labels = np.where(unlabelled, WALL if unlabelled.all() else OTHER, scene_map.labels)
     objects = _number_objects(labels, scene_map.occupancy == OCCUPIED)[tuple(cells.T)]
     labels = labels[tuple(cells.T)].astype(np.uint8)
     usual = np.array([_USUAL_MATERIAL[k] for k in range(len(_USUAL_MATERIAL))], np.uint8)

@@ -139,6 +139,49 @@ def test_world_made_from_a_map_is_seen_where_the_map_says():
     scene = SemanticMap(occupancy, labels, 0.05, Pose2(-1.0, 2.0, 0.0))
     world = world_from_map("room", scene, np.array(((0.5, 3.0), (3.0, 7.0), (6.0, 4.0))))
     found = simulate_recording(world, HOKUYO, seed=1, scans=20, people=0)
-    assert set(np.unique(found.batch.labels[found.batch.valid])) == {SOFA, WALL}
+    assert set(np.unique(found.batch.labels[found.batch.valid])) == {SOFA, OTHER}
     assert found.batch.ranges[found.batch.valid].max() < 10.0
     assert found.scene_map is scene
+
+
+def map_with_a_bench():
+    occupancy = np.full((120, 160), FREE, np.uint8)
+    occupancy[[0, -1]] = occupancy[:, [0, -1]] = OCCUPIED
+    occupancy[50:52, 100:110] = OCCUPIED
+    labels = np.where(occupancy == OCCUPIED, WALL, 255).astype(np.uint8)
+    labels[50:52, 100:110] = TABLE
+    return SemanticMap(occupancy, labels, 0.05, Pose2(-1.0, 2.0, 0.0))
+
+
+TOUR = np.array(((0.5, 3.0), (3.0, 7.0), (6.0, 4.0)))
+
+
+def test_what_touches_in_a_map_is_one_object_that_moves_as_a_whole():
+    world = world_from_map("room", map_with_a_bench(), TOUR)
+    table = world.primitives.labels == TABLE
+    assert len(np.unique(world.primitives.objects[table])) == 1
+    changed = perturb(world, 3, moved_share=1.0, clutter_per_m2=0.0, warp_m=0.0)
+    before, after = (w.primitives.segments[table].reshape(-1, 2) for w in (world, changed))
+    assert 0.3 <= np.hypot(*(after.mean(axis=0) - before.mean(axis=0))) <= 1.01
+    apart = [np.hypot(*(ends[:, None] - ends).T) for ends in (before, after)]
+    np.testing.assert_allclose(*apart, atol=1e-3)
+
+
+def test_walls_of_a_map_bend_by_three_to_five_centimetres():
+    world = world_from_map("room", map_with_a_bench(), TOUR)
+    changed = perturb(world, 3, moved_share=0.0, clutter_per_m2=0.0)
+    shift = changed.primitives.segments - world.primitives.segments
+    walls = world.primitives.labels[: len(shift)] == WALL
+    size = np.hypot(shift[:, 0], shift[:, 1])
+    assert size[walls].min() > 0.0298
+    assert size[walls].max() < 0.0502
+    assert size[~walls].max() < 1e-9
+    assert np.hypot(*(shift[:, 2:] - shift[:, :2]).T).max() < 0.005  # neighbours go together
+
+
+def test_a_map_without_classes_becomes_walls():
+    scene = map_with_a_bench()
+    plain = SemanticMap(
+        scene.occupancy, np.full_like(scene.labels, 255), scene.resolution, scene.origin
+    )
+    assert (world_from_map("room", plain, TOUR).primitives.labels == WALL).all()
