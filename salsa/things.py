@@ -24,6 +24,7 @@ from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
 
 Float = NDArray[np.float64]
 Labels = NDArray[np.uint8]
+Cells = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 _ALL_AROUND = np.ones((3, 3), np.bool_)
 _SIZE_M = 0.08  # difference in size between an object and the cells it was mapped as
@@ -145,13 +146,19 @@ def _middles(ledger: Ledger, rows: NDArray[np.int64], columns: NDArray[np.int64]
 def _outlines(
     ledger: Ledger, numbers: NDArray[np.int32], count: int, edge_m: float
 ) -> list[Outline]:
+    return [
+        Outline(_middles(ledger, *cells) * edge_m, ledger.hits[cells].astype(np.float64))
+        for cells in _groups(numbers, count)
+    ]
+
+
+def _groups(numbers: NDArray[np.int32], count: int) -> list[Cells]:
+    """Return rows and columns of the cells of each number from 1 to `count`."""
     rows, columns = np.nonzero(numbers)
-    points = _middles(ledger, rows, columns) * edge_m
-    weights = ledger.hits[rows, columns].astype(np.float64)
     of = numbers[rows, columns]
     order = np.argsort(of, kind="stable")
     borders = np.searchsorted(of[order], np.arange(2, count + 1))
-    return [Outline(points[part], weights[part]) for part in np.split(order, borders) if len(part)]
+    return [(rows[part], columns[part]) for part in np.split(order, borders) if len(part)]
 
 
 @dataclass(frozen=True)
@@ -174,9 +181,8 @@ def _gone_objects(
     for label in _ids_of(persistence.movable, taxonomy):
         mapped = _coarse_any((field.distance_m == 0) & (field.nearest_label == label), ratio, shape)
         numbers, count = _number(gone & mapped)
-        for number in range(1, count + 1):
-            cells = np.argwhere(numbers == number)[:, ::-1].astype(np.float64)
-            cells = (cells + 0.5) * (ratio * field.resolution)
+        for rows, columns in _groups(numbers, count):
+            cells: Float = (np.stack((columns, rows), axis=-1) + 0.5) * (ratio * field.resolution)
             middles.append(cells.mean(axis=0))
             sizes.append(_span(Outline(cells, np.ones(len(cells)))))
             labels.append(label)
