@@ -14,11 +14,11 @@ from typing import Any
 
 import numba
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import read_yaml
 from semantic2d_dataset.scene.geometry import rotation_matrix
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.scans import check_array
@@ -286,18 +286,7 @@ def _distortion_of(value: Any) -> tuple[float, float, float, float, float]:
 
 def _read_mapping(path: Path) -> Mapping[str, Any]:
     """Read the first document of a YAML file; ``rostopic echo`` ends each with a line."""
-    try:
-        found = next(iter(yaml.safe_load_all(path.read_text(encoding="utf-8"))), None)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        LookupError,
-        ArithmeticError,
-        RecursionError,
-    ) as err:
-        raise InvalidInputError(f"{path}: not a YAML or JSON file: {err}") from err
+    found = read_yaml(path, kind="a YAML or JSON file", several=True)
     if not isinstance(found, dict):
         raise InvalidInputError(f"{path}: expected a mapping, found {type(found).__name__}")
     return found

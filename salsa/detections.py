@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from salsa.detection_files import Entry, read_json, read_stream
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.sequence import SequenceReader
+from semantic2d_dataset.scene.documents import read_yaml
 from semantic2d_dataset.scene.scans import check_array
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
 
@@ -129,18 +129,7 @@ def read_names(path: Path) -> dict[str, str | None]:
     InvalidInputError
         If it is no mapping of names or numbers to names or null.
     """
-    try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (
-        yaml.YAMLError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        LookupError,
-        ArithmeticError,
-        RecursionError,
-    ) as err:
-        raise InvalidInputError(f"{path}: not a YAML or JSON file: {err}") from err
+    found = read_yaml(path, kind="a YAML or JSON file")
     if not isinstance(found, dict):
         raise InvalidInputError(f"{path}: expected a mapping, such as `dog: Other`")
     for key, value in found.items():

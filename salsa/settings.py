@@ -8,13 +8,12 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from salsa.alignment import TRUSTED, Acceptance
 from salsa.labelling import DEFAULT_TRANSFER, Transfer
 from salsa.smoothing import Smoothing
 from salsa.things import DEFAULT_PERSISTENCE, Persistence
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import read_yaml
 from semantic2d_dataset.scene.lines import FAST, LineParameters
 
 
@@ -48,14 +47,9 @@ def read_settings(path: Path | None, changes: Mapping[str, Any]) -> Settings:
     FileNotFoundError, InvalidInputError
         If the file is missing, or names what there is not.
     """
-    said: Any = {}
-    if path is not None:
-        try:
-            said = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        except (yaml.YAMLError, ValueError, RecursionError) as err:
-            raise InvalidInputError(f"{path}: not a YAML file: {err}") from err
-        if not isinstance(said, dict):
-            raise InvalidInputError(f"{path}: expected a mapping of steps to parameters")
+    said = {} if path is None else read_yaml(path) or {}
+    if not isinstance(said, dict):
+        raise InvalidInputError(f"{path}: expected a mapping of steps to parameters")
     for step, change in changes.items():
         both = isinstance(change, Mapping) and isinstance(said.get(step), Mapping)
         said[step] = {**said[step], **change} if both else change

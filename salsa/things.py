@@ -182,7 +182,8 @@ def _gone_objects(
         mapped = _coarse_any((field.distance_m == 0) & (field.nearest_label == label), ratio, shape)
         numbers, count = _number(gone & mapped)
         for rows, columns in _groups(numbers, count):
-            cells: Float = (np.stack((columns, rows), axis=-1) + 0.5) * (ratio * field.resolution)
+            cells = np.stack((columns, rows), axis=-1).astype(np.float64) + 0.5
+            cells *= ratio * field.resolution
             middles.append(cells.mean(axis=0))
             sizes.append(_span(Outline(cells, np.ones(len(cells)))))
             labels.append(label)

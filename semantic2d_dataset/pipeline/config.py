@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
-import yaml
 
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.manifest import check_names
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.pipeline.siblings import load_sibling
+from semantic2d_dataset.scene.documents import read_yaml
 
 _FILE_OPTIONS = ("poses", "lidar")
 """Options of the conversion that may name a file."""
@@ -121,7 +121,7 @@ def read_config(path: Path) -> Config:
         If it is not valid, or names files that do not exist.
     """
     path = Path(path).resolve()
-    said = _load(path)
+    said = read_yaml(path)
     problems = sorted(_problems(said))
     if problems:
         raise InvalidInputError(
@@ -149,13 +149,6 @@ def read_config(path: Path) -> Config:
         recordings=recordings,
         splits=said.get("splits"),
     )
-
-
-def _load(path: Path) -> Any:
-    try:
-        return yaml.safe_load(path.read_bytes())
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as err:
-        raise InvalidInputError(f"{path}: not valid YAML: {' '.join(str(err).split())}") from err
 
 
 @cache

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import read_yaml
 
 
 @dataclass(frozen=True)
@@ -153,10 +153,7 @@ def read_lidar(path: Path) -> LidarSpec:
     InvalidInputError
         If the file is not such a mapping, or a value is out of its domain.
     """
-    try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as err:
-        raise InvalidInputError(f"{path}: not a YAML file: {err}") from err
+    found = read_yaml(path)
     names = {field.name for field in fields(LidarSpec)}
     if not isinstance(found, dict) or not set(found) <= names:
         raise InvalidInputError(f"{path}: expected a mapping with the keys {sorted(names)}")

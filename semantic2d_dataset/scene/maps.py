@@ -13,22 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import read_yaml
 from semantic2d_dataset.scene.geometry import Pose2
 from semantic2d_dataset.scene.scans import check_array
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255
-
-# What PyYAML raises on text that is no YAML, or whose dates, numbers or nesting cannot be.
-_YAML_ERRORS = (
-    yaml.YAMLError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    LookupError,
-    ArithmeticError,
-    RecursionError,
-)
 
 
 @dataclass(frozen=True)
@@ -170,10 +160,7 @@ def write_map(path: Path, scene: SemanticMap) -> None:
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except _YAML_ERRORS as err:
-        raise InvalidInputError(f"{path}: not a map_server YAML file: {err}") from err
+    settings = read_yaml(path, kind="a map_server YAML file")
     if not isinstance(settings, dict):
         raise InvalidInputError(f"{path}: expected a map_server YAML mapping")
     return settings

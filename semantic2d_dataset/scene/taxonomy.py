@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import read_yaml
 
 UNLABELLED = 255
 """The id of a beam or cell that has no label."""
@@ -114,10 +114,7 @@ def read_taxonomy(path: Path) -> Taxonomy:
     InvalidInputError
         If it is not of that form.
     """
-    try:
-        found = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as err:
-        raise InvalidInputError(f"{path}: not a YAML file: {err}") from err
+    found = read_yaml(path)
     keys = {"classes", "extends", "background"}
     if not isinstance(found, dict) or not set(found) <= keys or "classes" not in found:
         raise InvalidInputError(f"{path}: expected a mapping with `classes`, out of {sorted(keys)}")

@@ -163,9 +163,9 @@ def test_several_problems_are_told_at_once(folder):
     ("text", "says"),
     [
         ("", "expected a mapping, found None"),
-        ("a: [", "not valid YAML"),
-        ("\x00", "not valid YAML"),
-        ("!!python/object/apply:os.getcwd []", "not valid YAML"),
+        ("a: [", "not a YAML file"),
+        ("\x00", "not a YAML file"),
+        ("!!python/object/apply:os.getcwd []", "not a YAML file"),
         (yaml.safe_dump([1]), r"expected a mapping, found \[1\]"),
     ],
 )

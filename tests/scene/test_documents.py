@@ -1,0 +1,40 @@
+import pytest
+
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import read_yaml
+
+
+def written(tmp_path, text):
+    (tmp_path / "a.yaml").write_text(text, encoding="utf-8")
+    return tmp_path / "a.yaml"
+
+
+def test_yaml_and_json_are_read_as_plain_values(tmp_path):
+    assert read_yaml(written(tmp_path, "a: [1, 2.5]\nb: c")) == {"a": [1, 2.5], "b": "c"}
+    assert read_yaml(written(tmp_path, '{"a": null}')) == {"a": None}
+    assert read_yaml(written(tmp_path, "")) is None
+
+
+def test_of_several_documents_the_first_is_read_where_that_is_wanted(tmp_path):
+    path = written(tmp_path, "a: 1\n---\nb: 2\n---\n")
+    assert read_yaml(path, several=True) == {"a": 1}
+    with pytest.raises(InvalidInputError, match="a.yaml: not a YAML file"):
+        read_yaml(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: [", "\x00", "a: 2024-13-45", "!!python/object/apply:os.getcwd []", "? {a: 1}", "[" * 5000],
+)
+def test_what_is_no_yaml_is_our_error_in_one_line(text, tmp_path):
+    with pytest.raises(InvalidInputError, match="a.yaml: not a camera: ") as told:
+        read_yaml(written(tmp_path, text), kind="a camera")
+    assert "\n" not in str(told.value)
+
+
+def test_bytes_that_are_no_text_are_our_error_and_a_missing_file_is_python_s(tmp_path):
+    (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InvalidInputError, match="not a YAML file"):
+        read_yaml(tmp_path / "a.yaml")
+    with pytest.raises(FileNotFoundError):
+        read_yaml(tmp_path / "none.yaml")
