@@ -5,7 +5,7 @@ Each takes a `Job` that names the files, so that little travels; whoever runs it
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,14 @@ from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.scene.lines import extract_lines
 from semantic2d_dataset.scene.maps import SemanticMap
 from semantic2d_dataset.scene.scans import ScanBatch
-from semantic2d_dataset.scene.taxonomy import Taxonomy
+from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
 
 BLOCK_SCANS = 8 * CHUNK_ROWS
 """Scans in memory at a time; neighbours help each other within a block."""
 
 Float = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
+Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,15 @@ def gather_block(job: Job, block: Block) -> Evidence:
     return gather(batch, found.poses, found.accepted, prepared.field)
 
 
-def label_block(job: Job, things: Things, block: Block) -> Arrays:
-    """Label scans, and extract their lines: arrays by their names in the sequence."""
+def label_block(job: Job, things: Things, block: Block) -> tuple[Arrays, Counts]:
+    """Label scans, and extract their lines.
+
+    Returns
+    -------
+    arrays, counts
+        Arrays by their names in the sequence, and how many beams have each label (256,): those
+        with a return, and those that are left unlabelled.
+    """
     prepared, found = prepare(job), aligned(block)
     batch = rough_batch(prepared.reader, block)
     labels, confidence = transfer_labels(
@@ -151,12 +159,13 @@ def label_block(job: Job, things: Things, block: Block) -> Arrays:
         range_min=batch.lidar.range_min,
         range_max=batch.lidar.range_max,
     )
-    return {
+    arrays: Arrays = {
         "scans/labels": labels,
         "scans/confidence": confidence,
         "lines/segments": segments,
         "lines/offsets": offsets,
     }
+    return arrays, np.bincount(labels[batch.valid | (labels == UNLABELLED)], minlength=256)
 
 
 def aligned(block: Block) -> Alignment:
@@ -167,9 +176,16 @@ def aligned(block: Block) -> Alignment:
 
 
 def rough_batch(reader: SequenceReader, block: Block) -> ScanBatch:
-    """Read scans with the poses that they had before any alignment."""
-    batch = reader.batch(block.start, block.stop)
-    return replace(batch, poses=rough_poses(reader, block.start, block.stop))
+    """Read the ranges of scans, with the poses that they had before any alignment."""
+    rows = block.start, block.stop
+    return ScanBatch(
+        reader.lidar,
+        reader.read("scans/ranges", *rows),
+        intensities=None,
+        labels=None,
+        poses=rough_poses(reader, *rows),
+        stamps_ns=reader.read("scans/stamps_ns", *rows),
+    )
 
 
 def rough_poses(reader: SequenceReader, start: int, stop: int) -> Float:

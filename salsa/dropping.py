@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from salsa.copying import copy_arrays
 from salsa.sequences import check_target
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.format.schema import CHUNK_ROWS
@@ -151,7 +150,7 @@ def drop_scans(source: Path, scans: ArrayLike, out: Path, *, force: bool = False
         with SequenceWriter(out, header) as writer:
             for name, value in _CLEARED.items():
                 _copy_cleared(reader, writer, name, dropped, value)
-            copy_arrays(reader, writer, _others(reader))
+            writer.copy(reader, _others(reader))
             scene = reader.read_map()
             if scene is not None:
                 writer.set_map(scene)

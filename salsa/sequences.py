@@ -32,7 +32,6 @@ from salsa.blocks import (
     rough_poses,
     rows_of,
 )
-from salsa.copying import copy_arrays
 from salsa.evidence import Ledger, coarse
 from salsa.settings import Settings
 from salsa.sightings import Sightings, sighting_files
@@ -49,9 +48,15 @@ MIN_ACCEPTED_SHARE = 1 / 3
 
 Facts = dict[str, Any]
 
-_OURS = ("scans/labels", "scans/confidence", "poses/refined", "provenance")
-_OUR_GROUPS = ("alignment/", "lines/", "map/")
-_PER_SCAN_GROUPS = ("scans/", "poses/", "commands/")
+_OURS = (
+    "scans/labels",
+    "scans/confidence",
+    "poses/refined",
+    "provenance",
+    "alignment/",
+    "lines/",
+    "map/",
+)
 
 
 @dataclass(frozen=True)
@@ -154,8 +159,8 @@ def label_sequence(
             _check_fit(source, found, corrections(rough, found.poses), header)
             things = _find_things(job, found, run)
             with SequenceWriter(out, header) as writer:
+                writer.copy(reader, _kept(reader))
                 counts = _write_all(job, writer, found, things, run, bar)
-                copy_arrays(reader, writer, _others(reader))
                 writer.set_map(prepared.scene)
         return _summarise(found, near_before, things, counts, taxonomy)
     finally:
@@ -311,25 +316,19 @@ def _write_all(
     run: Executor,
     bar: tqdm[Any],
 ) -> NDArray[np.int64]:
-    """Write labels, lines and what the source had, in order; return beams per label (256,)."""
-    reader = prepare(job).reader
+    """Write labels, lines and alignment, block by block; return beams per label (256,)."""
     counts = np.zeros(256, np.int64)
     lines = 0
-    blocks = blocks_of(len(reader))
+    blocks = blocks_of(len(found))
     results = run.map(partial(label_block, job, things), _with_alignment(job, found))
-    for block, arrays in zip(blocks, results, strict=True):
-        labels, offsets = arrays["scans/labels"], arrays["lines/offsets"]
-        copied = {
-            name: reader.read(name, block.start, block.stop)
-            for name in reader.names
-            if _is_kept(name)
-        }
+    for block, (arrays, of_block) in zip(blocks, results, strict=True):
+        offsets = arrays["lines/offsets"]
         arrays["lines/offsets"] = (offsets if block.start == 0 else offsets[1:]) + lines
-        writer.append(copied | arrays | _alignment_arrays(rows_of(found, block)))
+        writer.append(arrays)
         lines += len(arrays["lines/segments"])
-        returned = reader.lidar.has_return(copied["scans/ranges"])
-        counts += np.bincount(labels[returned | (labels == UNLABELLED)], minlength=256)
+        counts += of_block
         bar.update(block.stop - block.start)
+    writer.append(_alignment_arrays(found))
     return counts
 
 
@@ -343,15 +342,9 @@ def _alignment_arrays(found: Alignment) -> dict[str, NDArray[Any]]:
     }
 
 
-def _is_kept(name: str) -> bool:
-    """Tell whether an array has one row a scan and stays as it is."""
-    return name.startswith(_PER_SCAN_GROUPS) and name not in _OURS
-
-
-def _others(reader: SequenceReader) -> list[str]:
-    """Return what has rows of its own: streams, and fields of a published layout."""
-    ours = _OUR_GROUPS + _PER_SCAN_GROUPS
-    return [name for name in reader.names if name not in _OURS and not name.startswith(ours)]
+def _kept(reader: SequenceReader) -> list[str]:
+    """Return what the source has beside that which labelling makes."""
+    return [name for name in reader.names if not name.startswith(_OURS)]
 
 
 def _check_fit(

@@ -30,9 +30,17 @@ _CHUNKS_AHEAD = 8  # for each core: small ones cost more to keep than their byte
 _ROW = 256  # words; their sum fits 32 bits
 _Name = TypeVar("_Name")
 
+Chunk = NDArray[Any] | bytes
+"""Values, or what HDF5 stores of them."""
 
-def pack(chunk: NDArray[Any]) -> bytes:
-    """Return what HDF5 stores of a whole chunk: shuffled, deflated, and its checksum."""
+
+def pack(chunk: Chunk) -> bytes:
+    """Return what HDF5 stores of a whole chunk: shuffled, deflated, and its checksum.
+
+    What is packed already stays as it is.
+    """
+    if isinstance(chunk, bytes):
+        return chunk
     values = np.ascontiguousarray(chunk).reshape(-1).view(np.uint8)
     shuffled = np.ascontiguousarray(values.reshape(-1, chunk.dtype.itemsize).T)
     deflated = deflate(shuffled)
@@ -101,7 +109,7 @@ def _residue(total: int) -> int:
 
 
 def pack_in_order(
-    chunks: Iterable[tuple[_Name, NDArray[Any]]],
+    chunks: Iterable[tuple[_Name, Chunk]],
 ) -> Iterator[tuple[_Name, bytes]]:
     """Pack named chunks on all cores given; yield them in their order.
 
@@ -112,8 +120,9 @@ def pack_in_order(
     ahead, cores = 0, count_cores()
     with ThreadPoolExecutor(cores) as pool:
         for name, chunk in chunks:
-            waiting.append((name, chunk.nbytes, pool.submit(pack, chunk)))
-            ahead += chunk.nbytes
+            size = len(chunk) if isinstance(chunk, bytes) else chunk.nbytes
+            waiting.append((name, size, pool.submit(pack, chunk)))
+            ahead += size
             while ahead > _BYTES_AHEAD or len(waiting) > _CHUNKS_AHEAD * cores:
                 first, size, packed = waiting.popleft()
                 ahead -= size

@@ -100,6 +100,10 @@ class ContainerReader:
         dtype: np.dtype[Any] = self._guard(lambda: self._array(name).dtype)
         return dtype
 
+    def stored_bytes(self, name: str) -> int:
+        """Return how many bytes an array takes in the file."""
+        return int(self._guard(self._array(name).id.get_storage_size))
+
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Read rows start to stop of an array.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -162,6 +162,30 @@ class SequenceWriter:
         for name, array in arrays.items():
             self._rows[name] = self._rows.get(name, 0) + len(array)
 
+    def copy(self, reader: SequenceReader, names: Iterable[str]) -> None:
+        """Copy whole arrays of another sequence as they are stored, which costs little time.
+
+        Raises
+        ------
+        InvalidInputError
+            If rows of an array were written already, or its shape or stamps do not fit.
+        WriteError
+            If the disk is full, or a chunk of the other file is damaged.
+        """
+        for name in names:
+            where = f"{self._container.path}: {name}"
+            if name in _PER_BEAM and reader.lidar.beams != self.header.lidar.beams:
+                raise InvalidInputError(
+                    f"{where}: expected {self.header.lidar.beams} beams, found {reader.lidar.beams}"
+                )
+            if name == "scans/stamps_ns" and _goes_backward(reader.read(name)):
+                raise InvalidInputError(f"{where}: stamps go backward; split the recording there")
+            reader.copy_to(self._container, name)
+            self._rows[name] = reader.shape(name)[0]
+            if name == "scans/stamps_ns":
+                said = {"stamps_source": self.header.stamps_source}
+                self._container.set_attributes(name, said)
+
     def set_map(self, scene: SemanticMap) -> None:
         """Store the map that poses and labels refer to."""
         self._container.append({"map/occupancy": scene.occupancy, "map/labels": scene.labels})
@@ -264,6 +288,10 @@ class SequenceReader:
             If a checksum does not fit.
         """
         return self._container.read(name, start, stop)
+
+    def copy_to(self, writer: ContainerWriter, name: str) -> None:
+        """Copy a whole array into a file that is being written."""
+        writer.copy(self._container, name)
 
     def batch(self, start: int = 0, stop: int | None = None) -> ScanBatch:
         """Read scans start to stop with what else describes them.

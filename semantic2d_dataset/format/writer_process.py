@@ -13,7 +13,7 @@ import math
 import os
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import CorruptFileError, Semantic2DError
-from semantic2d_dataset.format.chunks import DEFLATE_LEVEL, is_intact, pack_in_order
+from semantic2d_dataset.format.chunks import DEFLATE_LEVEL, Chunk, is_intact, pack_in_order
 from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.schema import CHUNK_ROWS, SCHEMAS, FileSchema
 
@@ -70,7 +70,7 @@ class _Place(NamedTuple):
     stop: int
 
 
-_Chunks = Iterator[tuple[_Place, NDArray[Any]]]
+_Chunks = Iterator[tuple[_Place, Chunk]]
 
 
 class _GrowingArray:
@@ -106,11 +106,57 @@ def _chunks(stream: BufferedReader, file: Any, schema: FileSchema) -> _Chunks:
         if header["op"] == "attributes":
             _set_attributes(file, path, header["values"], schema)
             continue
+        if header["op"] == "copy":
+            yield from _copy(Path(header["source"]), file, path, schema)
+            continue
         if path not in arrays:
             arrays[path] = _GrowingArray(_new_array(file, path, header["dtype"], header["shape"]))
         yield from arrays[path].grow(stream, header["shape"][0])
     for array in arrays.values():
         yield from array.finish()
+
+
+def _copy(source: Path, file: Any, path: str, schema: FileSchema) -> _Chunks:
+    """Yield the chunks of a whole array of another file, as they are stored there.
+
+    An array that is stored in another way, by another writer, is read and packed again.
+    """
+    with ContainerReader(source, schema) as reader, h5py.File(source, "r", locking=False) as other:
+        given = other[path]
+        made = _new_array(file, path, given.dtype.str, given.shape)
+        same = _layout(given) == _layout(made)
+        for start in range(0, len(given), made.chunks[0]):
+            stop = min(start + made.chunks[0], len(given))
+            yield (
+                _Place(made.id, start, stop),
+                (
+                    _intact_chunk(source, given, start)
+                    if same
+                    else _padded(reader.read(path, start, stop), made)
+                ),
+            )
+
+
+def _layout(array: Any) -> tuple[Any, ...]:
+    filters = array.id.get_create_plist()
+    return (
+        array.dtype.str,
+        array.chunks,
+        [filters.get_filter(i)[0] for i in range(filters.get_nfilters())],
+    )
+
+
+def _intact_chunk(source: Path, array: Any, row: int) -> bytes:
+    skipped, stored = array.id.read_direct_chunk(_offset(array.id, row))
+    if skipped or not is_intact(stored):
+        raise CorruptFileError(f"{source}: {array.name}: a chunk is damaged; get the file again")
+    return bytes(stored)
+
+
+def _padded(rows: NDArray[Any], array: Any) -> NDArray[Any]:
+    chunk = np.zeros(array.chunks, array.dtype)
+    chunk[: len(rows)] = rows
+    return chunk
 
 
 def _read_header(stream: BufferedReader) -> Any:
@@ -133,7 +179,7 @@ def _set_attributes(file: Any, path: str, values: dict[str, Any], schema: FileSc
         owner.attrs.create(name, _encode(value, schema.attribute_kinds(path)[name]))
 
 
-def _new_array(file: Any, path: str, dtype: str, shape: list[int]) -> Any:
+def _new_array(file: Any, path: str, dtype: str, shape: Sequence[int]) -> Any:
     row_bytes = max(1, np.dtype(dtype).itemsize * math.prod(shape[1:]))
     wanted = CHUNK_ROWS if len(shape) > 1 else _FLAT_CHUNK
     return file.create_dataset(

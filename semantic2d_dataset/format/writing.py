@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 import semantic2d_dataset
 from semantic2d_dataset.errors import InvalidInputError, WriteError
+from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.schema import FORMAT_VERSION, FileSchema
 
 _FREE_BYTES_KEPT = 1 << 26
@@ -117,6 +118,22 @@ class ContainerWriter:
             rows = np.ascontiguousarray(array)
             header = {"op": "append", "path": name, "dtype": rows.dtype.str, "shape": rows.shape}
             self._send(header, rows)
+
+    def copy(self, reader: ContainerReader, name: str) -> None:
+        """Copy a whole array of another file of this kind, without packing it again.
+
+        Raises
+        ------
+        InvalidInputError
+            If rows of that array were written already, or the reader has none.
+        WriteError
+            If the disk is full or the child process failed.
+        """
+        if name in self._rows:
+            raise InvalidInputError(f"{self.path}: {name}: has rows already")
+        self._rows[name] = (reader.dtype(name).str, reader.shape(name)[1:])
+        self._check_space(reader.stored_bytes(name))
+        self._send({"op": "copy", "path": name, "source": str(reader.path.resolve())})
 
     def append_json(self, name: str, value: Any) -> None:
         """Write a value as UTF-8 JSON into an array of bytes."""

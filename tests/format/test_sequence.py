@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, WriteError
 from semantic2d_dataset.format.schema import FORMAT_VERSION
 from semantic2d_dataset.format.sequence import (
     SequenceHeader,
@@ -211,3 +211,79 @@ def test_stamps_whose_difference_is_beyond_int64_are_in_order(tmp_path):
         writer.append(wide)
     with SequenceReader(tmp_path / "a.h5") as reader:
         reader.check_values()
+
+
+def copied(source, out, names=None, header=None):
+    with SequenceReader(source) as reader:
+        kept = [name for name in reader.names if name != "provenance" and "map/" not in name]
+        with SequenceWriter(out, header or reader.header) as writer:
+            writer.copy(reader, kept if names is None else names)
+            scene = reader.read_map()
+            if scene is not None:
+                writer.set_map(scene)
+
+
+def stored(path, name):
+    with h5py.File(path) as file:
+        array = file[name]
+        places = range(0, len(array), array.chunks[0])
+        return [array.id.read_direct_chunk((row, *[0] * (array.ndim - 1)))[1] for row in places]
+
+
+@pytest.mark.parametrize("scans", [1, 64, 150])
+def test_a_copy_holds_the_same_chunks_and_more_may_be_added(scans, tmp_path):
+    make_sequence(tmp_path / "a.h5", scans)
+    copied(tmp_path / "a.h5", tmp_path / "b.h5")
+    with SequenceReader(tmp_path / "a.h5") as one, SequenceReader(tmp_path / "b.h5") as other:
+        other.check_values()
+        assert one.content_digest() == other.content_digest()
+        assert other.header.stamps_source == "synthetic"
+    for name in ("scans/ranges", "poses/initial"):
+        assert stored(tmp_path / "a.h5", name) == stored(tmp_path / "b.h5", name)
+    with (
+        SequenceReader(tmp_path / "a.h5") as reader,
+        SequenceWriter(tmp_path / "c.h5", reader.header) as writer,
+    ):
+        writer.copy(reader, ["scans/ranges", "scans/stamps_ns"])
+        writer.append({"scans/labels": np.ones((scans, SMALL_LIDAR.beams), np.uint8)})
+    with SequenceReader(tmp_path / "c.h5") as reader:
+        assert (reader.read("scans/labels") == 1).all()
+
+
+def test_arrays_stored_in_another_way_are_packed_again(tmp_path):
+    make_sequence(tmp_path / "a.h5", 150)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        ranges = file["scans/ranges"][:]
+        del file["scans/ranges"]
+        more = {"fletcher32": True, "compression": "gzip", "maxshape": (None, ranges.shape[1])}
+        file.create_dataset("scans/ranges", data=ranges, chunks=(17, ranges.shape[1]), **more)
+    copied(tmp_path / "a.h5", tmp_path / "b.h5")
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert file["scans/ranges"].chunks[0] == 64
+        np.testing.assert_array_equal(file["scans/ranges"][:], ranges)
+
+
+def test_a_damaged_chunk_is_not_copied(tmp_path):
+    make_sequence(tmp_path / "a.h5", 150)
+    with h5py.File(tmp_path / "a.h5") as file:
+        place = file["scans/ranges"].id.get_chunk_info(1)
+    data = bytearray((tmp_path / "a.h5").read_bytes())
+    data[place.byte_offset + place.size // 2] ^= 0xFF
+    (tmp_path / "a.h5").write_bytes(data)
+    with pytest.raises(WriteError, match="a.h5: /scans/ranges: a chunk is damaged"):
+        copied(tmp_path / "a.h5", tmp_path / "b.h5")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_what_does_not_fit_is_not_copied(tmp_path):
+    make_sequence(tmp_path / "a.h5", 20)
+    other = SequenceHeader("a", "b", LIDARS["wlr-716"])
+    with pytest.raises(InvalidInputError, match="scans/ranges: expected 811 beams, found 37"):
+        copied(tmp_path / "a.h5", tmp_path / "b.h5", ["scans/ranges"], other)
+    with pytest.raises(InvalidInputError, match="scans/ranges: has rows already"):
+        copied(tmp_path / "a.h5", tmp_path / "b.h5", ["scans/ranges", "scans/ranges"])
+    with pytest.raises(InvalidInputError, match="has no array 'scans/confidence'"):
+        copied(tmp_path / "a.h5", tmp_path / "b.h5", ["scans/confidence"])
+    with pytest.raises(InvalidInputError, match="a sequence needs scans/ranges"):
+        copied(tmp_path / "a.h5", tmp_path / "b.h5", ["scans/stamps_ns"])
+    assert not (tmp_path / "b.h5").exists()
