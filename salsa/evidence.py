@@ -1,9 +1,9 @@
 """What a recording says of each place: how long something was there, and how long nothing was.
 
 A beam that ends in a cell says that something stands there, one that goes on beyond it that
-nothing does. Both are counted in seconds, so that neither the rate of the lidar nor the distance
-weighs: what stays is hit whenever it is looked at, and where people walk the lidar mostly sees
-through.
+nothing does. Both are counted in looks of a second, so that neither the rate of the lidar nor the
+distance weighs: what stays is hit from begin to end of a look, and where people walk, a foot that
+rests is gone before the look is over and the lidar sees through in the next.
 """
 
 from __future__ import annotations
@@ -27,10 +27,13 @@ Counts = NDArray[np.int32]
 CELL_M = 0.05
 """Finer maps are counted in cells of about this size: a leg is seen as several of them."""
 
-_SECOND_NS = 1_000_000_000
+LOOK_S = 1.0
+"""How long a look takes: a foot of somebody who walks rests for half of it or less."""
+
+_HELD_SHARE = 0.7  # of a look, between its first and its last hit
 _STEP = 0.7  # of a cell, along a beam
 _SHORT_M = 0.2  # before its end, where a beam no longer says that nothing is there
-_STRIDE_RAD = math.radians(0.5)  # beams nearer to each other see through the same cells
+_STRIDE_RAD = math.radians(0.5)  # beams nearer to each other pass through the same cells
 
 
 @dataclass(frozen=True)
@@ -43,16 +46,18 @@ class Evidence:
         (K,) i8 flat indices, increasing.
     hits
         (K,) i4 beams that ended in the cell.
-    seconds, passes
-        (K,) i4 seconds in which a beam ended in it, and in which one passed through.
+    met, held, passed
+        (K,) i4 looks in which a beam ended in it, in which beams did from begin to end, and in
+        whose first scan one passed through it.
     offsets
         (K, 2) f8 sum of where in the cell the beams ended: x, y from its middle, in cells.
     """
 
     cells: NDArray[np.int64]
     hits: Counts
-    seconds: Counts
-    passes: Counts
+    met: Counts
+    held: Counts
+    passed: Counts
     offsets: Float
 
 
@@ -68,22 +73,24 @@ def gather(
 ) -> Evidence:
     """Count what N scans in the order of time met; poses (N, 3) are those of the base.
 
-    Only scans that are accepted (N,) count. Of each second, all scans say where something is, and
-    the first one where nothing is.
+    Only scans that are accepted (N,) count. A look takes a second, or four scans of a slow lidar.
     """
     ratio, shape = coarse(field)
     beams = beams_of(batch, batch.valid & accepted[:, None])
     in_grid = compose(invert(field.origin.as_array()), poses)
-    seconds = batch.stamps_ns // _SECOND_NS
-    counts = np.zeros((5, *shape), np.int32)
-    offsets = np.zeros((*shape, 2))
-    relative = (seconds - seconds[:1] + 1).astype(np.int32)
+    seconds = (batch.stamps_ns - batch.stamps_ns[:1]) / 1e9
+    period_s = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    look_s = max(LOOK_S, 4 * period_s)
+    looks = seconds / look_s
+    counts = np.zeros((6, *shape), np.int32)
+    sums = np.zeros((3, *shape))
     stride = max(round(_STRIDE_RAD / batch.lidar.angle_increment), 1)
-    _count(*beams, in_grid, relative, field.resolution * ratio, stride, counts, offsets)
-    hits, held, _, passed, _ = counts
+    _count(*beams, in_grid, looks, field.resolution * ratio, stride, counts, sums)
+    hits, met, held, _, passed, _ = counts
     cells = np.flatnonzero((hits > 0) | (passed > 0))
     at = np.unravel_index(cells, shape)
-    return Evidence(cells, hits[at], held[at], passed[at], offsets[at])
+    offsets = np.stack((sums[0][at], sums[1][at]), axis=-1)
+    return Evidence(cells, hits[at], met[at], held[at], passed[at], offsets)
 
 
 class Ledger:
@@ -97,8 +104,9 @@ class Ledger:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.hits = np.zeros(shape, np.int64)
-        self.seconds = np.zeros(shape, np.int32)
-        self.passes = np.zeros(shape, np.int32)
+        self.met = np.zeros(shape, np.int32)
+        self.held = np.zeros(shape, np.int32)
+        self.passed = np.zeros(shape, np.int32)
         self.offsets = np.zeros((*shape, 2))
 
     def add(self, found: Evidence) -> Self:
@@ -116,14 +124,20 @@ def _count(
     directions: Float,
     offset: Float,
     poses: Float,
-    seconds: Counts,
+    looks: Float,
     cell_m: float,
     stride: int,
     counts: Counts,
-    offsets: Float,
+    sums: Float,
 ) -> None:
-    """Add to counts (5, H, W): hits, seconds hit, last of these, seconds passed, last of these."""
-    hits, held, held_last, passed, passed_last = counts
+    """Add to what is known of each cell; `looks` (N,) is the time in looks.
+
+    `counts` (6, H, W): hits, looks met, looks held, the last look met (its negative number where
+    it is held), looks passed, the last of them. `sums` (3, H, W): offsets x and y, and when the
+    last look met was first hit.
+    """
+    hits, met, held, met_last, passed, passed_last = counts
+    sum_x, sum_y, since = sums
     rows, columns = hits.shape
     before = 0
     for n in range(ranges.shape[0]):
@@ -132,8 +146,9 @@ def _count(
         cos, sin = np.cos(poses[n, 2]) / cell_m, np.sin(poses[n, 2]) / cell_m
         x0 = poses[n, 0] / cell_m + cos * offset[0] - sin * offset[1]
         y0 = poses[n, 1] / cell_m + sin * offset[0] + cos * offset[1]
-        looks_through = seconds[n] != before
-        before = seconds[n]
+        look = int(looks[n]) + 1
+        first = look != before
+        before = look
         for k in range(ranges.shape[1]):
             if not use[n, k]:
                 continue
@@ -144,16 +159,37 @@ def _count(
             column, row = int(np.floor(x)), int(np.floor(y))
             if 0 <= row < rows and 0 <= column < columns:
                 hits[row, column] += 1
-                offsets[row, column, 0] += x - column - 0.5
-                offsets[row, column, 1] += y - row - 0.5
-                if held_last[row, column] != seconds[n]:
-                    held_last[row, column] = seconds[n]
+                sum_x[row, column] += x - column - 0.5
+                sum_y[row, column] += y - row - 0.5
+                last = met_last[row, column]
+                if abs(last) != look:
+                    met_last[row, column] = look
+                    met[row, column] += 1
+                    since[row, column] = looks[n]
+                elif last == look and looks[n] - since[row, column] >= _HELD_SHARE:
+                    met_last[row, column] = -look
                     held[row, column] += 1
-            if looks_through and k % stride == 0:
-                for step in range(int((r - _SHORT_M) / (_STEP * cell_m))):
-                    along = step * _STEP * cell_m
-                    column, row = int(np.floor(x0 + along * dx)), int(np.floor(y0 + along * dy))
-                    inside = 0 <= row < rows and 0 <= column < columns
-                    if inside and passed_last[row, column] != seconds[n]:
-                        passed_last[row, column] = seconds[n]
-                        passed[row, column] += 1
+            if first and k % stride == 0:
+                way = (r - _SHORT_M) / cell_m  # cells
+                _pass_through(x0, y0, dx * cell_m, dy * cell_m, way, look, passed, passed_last)
+
+
+@numba.njit(cache=True)
+def _pass_through(
+    x: float,
+    y: float,
+    dx: float,
+    dy: float,
+    way: float,
+    look: int,
+    passed: Counts,
+    passed_last: Counts,
+) -> None:
+    """Count a look for the cells on a beam; start, direction and way are in cells."""
+    for step in range(int(way / _STEP)):
+        column = int(np.floor(x + step * _STEP * dx))
+        row = int(np.floor(y + step * _STEP * dy))
+        inside = 0 <= row < passed.shape[0] and 0 <= column < passed.shape[1]
+        if inside and passed_last[row, column] != look:
+            passed_last[row, column] = look
+            passed[row, column] += 1

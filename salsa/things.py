@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from salsa.evidence import Ledger, coarse
+from salsa.evidence import LOOK_S, Ledger, coarse
 from salsa.fields import MapField
 from salsa.legs import Outline, find_standing, principal_axis
 from semantic2d_dataset.errors import InvalidInputError
@@ -29,8 +29,9 @@ Cells = tuple[NDArray[np.int64], NDArray[np.int64]]
 _ALL_AROUND = np.ones((3, 3), np.bool_)
 _SIZE_M = 0.08  # difference in size between an object and the cells it was mapped as
 _SIZE_SHARES = (0.45, 1.35)  # of the mapped size: a thing may be seen from one side only
-_GONE_SECONDS = 3
-_HELD_SHARE = 0.3  # of the seconds looked at: a mapped cell that is hit as often is still there
+_GONE_LOOKS = 3
+_HELD_SHARE = 0.15  # of the looks met by a group: things have 0.2 and more, crowds 0.08 and less
+_STILL_SHARE = 0.3  # of the looks: a mapped cell that is hit as often is still there
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def find_things(
     """Find what stays in free space, farther than `object_m` from what is mapped."""
     ratio, _ = coarse(field)
     stays = _staying(ledger, field, object_m, persistence)
-    numbers, count = _number(stays)
+    numbers, count = _held_groups(ledger, stays)
     outlines = _outlines(ledger, numbers, count, ratio * field.resolution)
     standing = find_standing(outlines)
     gone = _gone_objects(ledger, field, persistence, taxonomy)
@@ -120,15 +121,28 @@ def _staying(
     ledger: Ledger, field: MapField, object_m: float, persistence: Persistence
 ) -> NDArray[np.bool_]:
     """Tell which coarse cells hold something in free space that stays."""
-    looked = np.maximum(ledger.seconds + ledger.passes, 1)
-    stays = (ledger.seconds >= persistence.min_seconds) & (
-        ledger.seconds >= persistence.min_share * looked
+    looked = np.maximum(ledger.met + ledger.passed, 1)
+    stays = (ledger.met * LOOK_S >= persistence.min_seconds) & (
+        ledger.met >= persistence.min_share * looked
     )
     rows, columns = np.nonzero(stays)
     cells = _middles(ledger, rows, columns) * coarse(field)[0]  # of the map, x y
     column, row = np.minimum(cells.astype(np.int64), np.array(field.free.shape)[::-1] - 1).T
     stays[rows, columns] = field.free[row, column] & (field.distance_m[row, column] > object_m)
     return np.asarray(stays)
+
+
+def _held_groups(ledger: Ledger, stays: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
+    """Give a number to each group of cells that something held from begin to end of looks.
+
+    Where many people walk, cells are met in many looks, by one foot after the other; each is gone
+    before a look is over.
+    """
+    numbers, count = _number(stays)
+    index = np.arange(1, count + 1)
+    met, held = (ndimage.sum_labels(each, numbers, index) for each in (ledger.met, ledger.held))
+    gone = np.concatenate(((False,), held < _HELD_SHARE * met))
+    return _number(stays & ~gone[numbers])
 
 
 def _number(cells: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
@@ -175,8 +189,8 @@ def _gone_objects(
 ) -> _Gone:
     """Find the mapped objects that the lidar looked through."""
     ratio, shape = coarse(field)
-    held = ndimage.maximum_filter(ledger.seconds, size=3)  # walls and poses are not exact
-    gone = (ledger.passes >= _GONE_SECONDS) & (held < _HELD_SHARE * ledger.passes)
+    held = ndimage.maximum_filter(ledger.met, size=3)  # walls and poses are not exact
+    gone = (ledger.passed >= _GONE_LOOKS) & (held < _STILL_SHARE * ledger.passed)
     middles, sizes, labels = [], [], []
     for label in _ids_of(persistence.movable, taxonomy):
         mapped = _coarse_any((field.distance_m == 0) & (field.nearest_label == label), ratio, shape)

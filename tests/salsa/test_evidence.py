@@ -36,22 +36,32 @@ def edge_of(box):
     return int((box[1] + box[3]) / 2 / rooms.RESOLUTION), int((box[2] - 0.01) / rooms.RESOLUTION)
 
 
-def test_what_stays_is_hit_in_every_second_and_seen_through_in_none():
+def test_what_stays_is_met_and_held_in_every_look_and_seen_through_in_none():
     found = counted(watch(4, lambda _: [BOX]))
-    assert found.seconds[edge_of(BOX)] == 4
-    assert found.passes[edge_of(BOX)] == 0
+    assert found.met[edge_of(BOX)] == 4
+    assert found.held[edge_of(BOX)] == 4
+    assert found.passed[edge_of(BOX)] == 0
     assert found.hits[edge_of(BOX)] >= 4 * 20
 
 
 def test_what_leaves_is_seen_through_afterwards():
     found = counted(watch(6, lambda t: [BOX] if t < 2 else []))
-    assert found.seconds[edge_of(BOX)] == 2
-    assert found.passes[edge_of(BOX)] == 4
+    assert found.met[edge_of(BOX)] == 2
+    assert found.passed[edge_of(BOX)] == 4
 
 
-def test_seconds_do_not_depend_on_the_rate_of_the_lidar():
+def test_what_comes_and_goes_within_a_look_holds_none():
+    found = counted(watch(6, lambda t: [BOX] if t % 1 < 0.4 else []))
+    assert found.met[edge_of(BOX)] == 6
+    assert found.held[edge_of(BOX)] == 0
+
+
+def test_looks_do_not_depend_on_the_rate_of_the_lidar():
     for rate in (5, 40):
-        assert counted(watch(3, lambda _: [BOX], rate)).seconds[edge_of(BOX)] == 3
+        found = counted(watch(3, lambda _: [BOX], rate))
+        assert (found.met[edge_of(BOX)], found.held[edge_of(BOX)]) == (3, 3)
+    slow = counted(watch(12, lambda _: [BOX], rate=1))  # a look takes four scans
+    assert (slow.met[edge_of(BOX)], slow.held[edge_of(BOX)]) == (3, 3)
 
 
 def test_blocks_add_up_to_the_whole():
@@ -67,7 +77,7 @@ def test_blocks_add_up_to_the_whole():
         )
         ledger.add(gather(part, part.poses, np.ones(40, bool), field))
     whole = counted(batch)
-    for name in ("hits", "seconds", "passes"):
+    for name in ("hits", "met", "held", "passed"):
         np.testing.assert_array_equal(getattr(ledger, name), getattr(whole, name))
     np.testing.assert_allclose(ledger.offsets, whole.offsets)
 
@@ -83,7 +93,7 @@ def test_scans_that_are_not_accepted_say_nothing():
     batch = watch(2, lambda _: [BOX])
     found = counted(batch, np.zeros(len(batch), bool))
     assert not found.hits.any()
-    assert not found.passes.any()
+    assert not found.passed.any()
 
 
 def test_fine_maps_are_counted_in_cells_of_five_centimetres():

@@ -51,6 +51,14 @@ def test_who_walks_by_stays_shortly_or_leaves_remains_a_person():
     assert (labels == PERSON).sum() > 1000  # seen through for longer than it was there
 
 
+def test_many_feet_one_after_the_other_are_no_thing():
+    """A crowd meets a place in every look; nobody stays."""
+    batch = watch(12, lambda t: [BOX] if t % 1 < 0.5 else [])
+    found, labels = things_in(batch, persistence=Persistence(min_share=0.3))
+    assert found.things == found.standing == 0
+    assert (labels == PERSON).sum() > 1000
+
+
 def test_a_mapped_object_that_was_moved_is_found_again():
     scene = rooms.room_map()
     old = (5.525, 2.225, 5.825, 2.525)  # a small table of the map, where now nothing is
