@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from salsa.fields import MapField, as_field, has_labels
-from salsa.registration import base_points, beams_of
+from salsa.registration import beams_of
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError
 from semantic2d_dataset.scene.geometry import compose, invert
 from semantic2d_dataset.scene.maps import SemanticMap
@@ -125,7 +125,7 @@ def transfer_labels(
     return labels, confidence
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _transfer(
     ranges: NDArray[np.float32],
     valid: NDArray[np.bool_],
@@ -146,33 +146,36 @@ def _transfer(
     confidence: Labels,
 ) -> None:
     object_m, sure_m = limits
+    per_object, per_sure = 0.5 / object_m, 1.0 / sure_m
     no_return, other, person = special
+    rows, columns = free.shape
     for n in numba.prange(ranges.shape[0]):
         if not accepted[n]:
             continue
         labels[n] = no_return
-        points = base_points(ranges[n], valid[n], directions, offset)
-        c, s = np.cos(poses[n, 2]), np.sin(poses[n, 2])
-        p = -1
+        best = 255.0 * min(max(quality[n], 0.0), 1.0)
+        cos, sin = np.cos(poses[n, 2]) / resolution, np.sin(poses[n, 2]) / resolution
+        x0, y0 = poses[n, 0] / resolution, poses[n, 1] / resolution
         for k in range(ranges.shape[1]):
             if not valid[n, k]:
                 continue
-            p += 1
-            x = poses[n, 0] + c * points[p, 0] - s * points[p, 1]
-            y = poses[n, 1] + s * points[p, 0] + c * points[p, 1]
-            column, row = int(np.floor(x / resolution)), int(np.floor(y / resolution))
-            inside = 0 <= row < free.shape[0] and 0 <= column < free.shape[1]
-            sure = 1.0
+            r = np.float64(ranges[n, k])
+            bx, by = offset[0] + r * directions[k, 0], offset[1] + r * directions[k, 1]
+            x, y = x0 + cos * bx - sin * by, y0 + sin * bx + cos * by
             labels[n, k] = other
-            if inside and distance_m[row, column] <= object_m:
-                if nearest_label[row, column] != UNLABELLED:
-                    labels[n, k] = nearest_label[row, column]
-                    sure = 1.0 - 0.5 * distance_m[row, column] / object_m
-                    sure *= 0.5 + 0.5 * min(1.0, border_m[row, column] / sure_m)
-            elif inside and things[row, column] != UNLABELLED:
-                labels[n, k] = things[row, column]
-                sure = 0.5
-            elif inside and free[row, column]:
-                labels[n, k] = person
-                sure = 0.5 + 0.5 * min(1.0, (distance_m[row, column] - object_m) / sure_m)
-            confidence[n, k] = np.uint8(255.0 * sure * min(max(quality[n], 0.0), 1.0))
+            sure = 1.0
+            if x >= 0.0 and y >= 0.0 and x < columns and y < rows:
+                row, column = int(y), int(x)
+                away = distance_m[row, column]
+                if away <= object_m:
+                    if nearest_label[row, column] != UNLABELLED:
+                        labels[n, k] = nearest_label[row, column]
+                        border = min(1.0, border_m[row, column] * per_sure)
+                        sure = (1.0 - away * per_object) * (0.5 + 0.5 * border)
+                elif things[row, column] != UNLABELLED:
+                    labels[n, k] = things[row, column]
+                    sure = 0.5
+                elif free[row, column]:
+                    labels[n, k] = person
+                    sure = 0.5 + 0.5 * min(1.0, (away - object_m) * per_sure)
+            confidence[n, k] = np.uint8(best * sure)

@@ -1,7 +1,7 @@
 """The numerical heart of the alignment: robust scan-to-map registration on a distance field.
 
 Poses are x, y, yaw in the frame of the grid (m, rad; the corner of cell (0, 0) is its origin),
-points are (P, 2) f8 in m in the base frame. The distance field comes as a surface (H, W, 4) f4:
+points are (2, P) f4 in m in the base frame. The distance field comes as a surface (H, W, 4) f4:
 between the centres of four cells the distance in m is ``d + du fu + (dv + duv fu) fv``, with what
 is looked up together lying together.
 """
@@ -21,6 +21,7 @@ from semantic2d_dataset.scene.scans import ScanBatch
 Float = NDArray[np.float64]
 Surface = NDArray[np.float32]
 Seen = NDArray[np.float32]
+Points = NDArray[np.float32]
 _FAST = {"reassoc", "contract", "nsz", "arcp"}  # sums need not keep their order
 
 FIRST_SCALE_M, LAST_SCALE_M = 0.5, 0.1  # finer than 0.1 m is worse where the world has changed
@@ -52,6 +53,13 @@ class Normals(NamedTuple):
     weights: float
 
 
+class Work(NamedTuple):
+    """Room for what is looked up of P points: `seen` (4, P) f4 and the index of their `cells`."""
+
+    seen: Seen
+    cells: NDArray[np.int32]
+
+
 Beams = tuple[NDArray[np.float32], NDArray[np.bool_], Float, Float]
 """What the kernels take of N scans: ranges (N, B), which to use (N, B), directions (B, 2) of the
 beams in the base frame, and the lidar's place (2,) there."""
@@ -66,20 +74,32 @@ def beams_of(batch: ScanBatch, use: NDArray[np.bool_]) -> Beams:
 @numba.njit(cache=True)
 def base_points(
     ranges: NDArray[np.float32], use: NDArray[np.bool_], directions: Float, offset: Float
-) -> Float:
-    """Return the endpoints (P, 2) in the base frame of the beams to use."""
-    points = np.empty((len(ranges), 2))
+) -> Points:
+    """Return the endpoints (2, P) in the base frame of the beams to use."""
+    points = np.empty((2, len(ranges)), np.float32)
     count = 0
     for k in range(len(ranges)):
         if use[k]:
             r = np.float64(ranges[k])
-            points[count, 0] = offset[0] + r * directions[k, 0]
-            points[count, 1] = offset[1] + r * directions[k, 1]
+            points[0, count] = offset[0] + r * directions[k, 0]
+            points[1, count] = offset[1] + r * directions[k, 1]
             count += 1
-    return points[:count]
+    return points[:, :count]
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True)
+def workspace(points: int) -> Work:
+    """Return room for that many points."""
+    return Work(np.empty((4, points), np.float32), np.empty(points, np.int32))
+
+
+@numba.njit(cache=True)
+def thinned(points: Points, wanted: int) -> Points:
+    """Return every so-manieth point, so that about `wanted` are left, side by side."""
+    return np.ascontiguousarray(points[:, :: max(points.shape[1] // wanted, 1)])
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def distance_at(u: float, v: float, surface: Surface) -> float:
     """Return the distance in m at column u, row v (0, 0 is the centre of a cell); -1 beyond it."""
     rows, columns = surface.shape[:2]
@@ -92,60 +112,79 @@ def distance_at(u: float, v: float, surface: Surface) -> float:
     return distance
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def robust_cost(
-    points: Float, stride: int, pose: Float, surface: Surface, resolution: float, scale: float
+    points: Points, pose: Float, surface: Surface, resolution: float, scale: float
 ) -> float:
     """Return the mean Geman-McClure cost 0..1 of the points; outside the map a point costs 1."""
     c, s = math.cos(pose[2]) / resolution, math.sin(pose[2]) / resolution
     u0, v0 = pose[0] / resolution - 0.5, pose[1] / resolution - 0.5
-    total, count = 0.0, 0
-    for k in range(0, len(points), stride):
-        x, y = points[k, 0], points[k, 1]
+    total = 0.0
+    for k in range(points.shape[1]):
+        x, y = points[0, k], points[1, k]
         d = distance_at(u0 + c * x - s * y, v0 + s * x + c * y, surface)
         total += d * d / (d * d + scale * scale) if d >= 0.0 else 1.0
-        count += 1
-    return total / max(count, 1)
+    cost: float = total / max(points.shape[1], 1)
+    return cost
 
 
-@numba.njit(cache=True, fastmath=_FAST)
-def look_up(
-    points: Float, stride: int, pose: Float, surface: Surface, resolution: float, seen: Seen
-) -> int:
-    """Write distance, its slopes by x and y, and by yaw, of the points on the map into `seen`.
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def look_up(points: Points, pose: Float, surface: Surface, resolution: float, work: Work) -> int:
+    """Write distance, its slopes by x and y, and by yaw, of the points on the map into `work.seen`.
 
-    Slopes are in m a cell; returns how many points they are. Kept apart from `weigh`, so that the
-    sums there run over what lies side by side.
+    Slopes are in m a cell; returns how many points they are. First all places are computed, then
+    all cells fetched: the former is done for many points at once, and so are the sums in `weigh`.
     """
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    per_m = 1.0 / resolution
-    u0, v0 = pose[0] * per_m - 0.5, pose[1] * per_m - 0.5
-    rows, columns = surface.shape[:2]
+    seen, cells = work
+    place(points, pose, surface.shape, resolution, seen, cells)
+    flat = surface.reshape(-1, 4)
     count = 0
-    for k in range(0, len(points), stride):
-        dx = cos * points[k, 0] - sin * points[k, 1]
-        dy = sin * points[k, 0] + cos * points[k, 1]
-        u, v = u0 + dx * per_m, v0 + dy * per_m
-        if u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1:
-            column, row = int(u), int(v)
-            fu, fv = np.float32(u - column), np.float32(v - row)
-            d, du, dv, duv = surface[row, column]
+    for k in range(points.shape[1]):
+        if cells[k] >= 0:
+            d, du, dv, duv = flat[cells[k]]
+            dx, dy, fu, fv = seen[0, k], seen[1, k], seen[2, k], seen[3, k]
             gx, gy = du + duv * fv, dv + duv * fu
             seen[0, count] = d + du * fu + gy * fv
             seen[1, count], seen[2, count] = gx, gy
-            seen[3, count] = gy * np.float32(dx) - gx * np.float32(dy)
+            seen[3, count] = gy * dx - gx * dy
             count += 1
     return count
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+def place(
+    points: Points,
+    pose: Float,
+    shape: tuple[int, int, int],
+    resolution: float,
+    seen: Seen,
+    cells: NDArray[np.int32],
+) -> None:
+    """Write where points lie: from the robot (m) and in their cell, and its index; -1 beyond."""
+    c, s = np.float32(math.cos(pose[2])), np.float32(math.sin(pose[2]))
+    per_m, zero = np.float32(1.0 / resolution), np.float32(0.0)
+    u0 = np.float32(pose[0] / resolution - 0.5)
+    v0 = np.float32(pose[1] / resolution - 0.5)
+    rows, columns = np.float32(shape[0] - 1), np.float32(shape[1] - 1)
+    for k in range(points.shape[1]):
+        dx, dy = c * points[0, k] - s * points[1, k], s * points[0, k] + c * points[1, k]
+        u, v = u0 + dx * per_m, v0 + dy * per_m
+        inside = (u >= zero) & (v >= zero) & (u < columns) & (v < rows)
+        column, row = np.int32(u) if inside else np.int32(0), np.int32(v) if inside else np.int32(0)
+        cells[k] = row * np.int32(shape[1]) + column if inside else np.int32(-1)
+        seen[0, k], seen[1, k] = dx, dy
+        seen[2, k], seen[3, k] = u - np.float32(column), v - np.float32(row)
+
+
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def weigh(seen: Seen, count: int, resolution: float, scale: float) -> Normals:
     """Sum up the normal equations of the points that `look_up` found."""
+    d_of, gx_of, gy_of, gt_of = seen[0], seen[1], seen[2], seen[3]  # rows, for the vectoriser
     zero, scale2 = np.float32(0.0), np.float32(scale * scale)
     g0, g1, g2, squares, weights = zero, zero, zero, zero, zero
     h00, h01, h02, h11, h12, h22 = zero, zero, zero, zero, zero, zero
     for k in range(count):
-        d, gx, gy, gt = seen[0, k], seen[1, k], seen[2, k], seen[3, k]
+        d, gx, gy, gt = d_of[k], gx_of[k], gy_of[k], gt_of[k]
         share = scale2 / (scale2 + d * d)
         w = share * share
         wx, wy, wt, wd = w * gx, w * gy, w * gt, w * d
@@ -162,7 +201,7 @@ def weigh(seen: Seen, count: int, resolution: float, scale: float) -> Normals:
     )
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def fit_quality(seen: Seen, count: int, points: int, inlier_m: float) -> tuple[float, float]:
     """Return the rms distance of the inliers (m), and their share of all points."""
     limit, squares, inliers = np.float32(inlier_m), np.float32(0.0), 0
@@ -176,7 +215,7 @@ def fit_quality(seen: Seen, count: int, points: int, inlier_m: float) -> tuple[f
     return math.sqrt(squares / inliers), inliers / points
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 def cost_of(seen: Seen, count: int, points: int, scale: float) -> float:
     """Return the mean Geman-McClure cost 0..1; a point outside the map costs 1."""
     total, scale2 = np.float32(0.0), np.float32(scale * scale)
@@ -188,7 +227,7 @@ def cost_of(seen: Seen, count: int, points: int, scale: float) -> float:
 
 @numba.njit(cache=True)
 def refine(
-    points: Float, start: Float, surface: Surface, resolution: float, first_scale: float
+    points: Points, start: Float, surface: Surface, resolution: float, first_scale: float
 ) -> tuple[Float, float]:
     """Move a pose so that the points lie on the map: Gauss-Newton with a shrinking robust scale.
 
@@ -197,12 +236,12 @@ def refine(
     pose, cost
         (3,), and its cost at the last scale.
     """
-    seen = np.empty((4, len(points)), np.float32)
+    work = workspace(points.shape[1])
+    few, more = thinned(points, COARSE_POINTS), thinned(points, FINE_POINTS)
     pose, scale, fine = start.copy(), first_scale, 0
     for _ in range(MAX_STEPS):
-        stride = max(len(points) // (COARSE_POINTS if fine == 0 else FINE_POINTS), 1)
-        count = look_up(points, stride, pose, surface, resolution, seen)
-        found = weigh(seen, count, resolution, scale)
+        count = look_up(few if fine == 0 else more, pose, surface, resolution, work)
+        found = weigh(work.seen, count, resolution, scale)
         step = solve(found.hessian, found.gradient, 1e-3 * found.weights + 1e-9)
         pose -= step
         if scale <= LAST_SCALE_M:
@@ -211,8 +250,8 @@ def refine(
                 break
             fine += done or fine > 0
         scale = max(scale * SHRINK, LAST_SCALE_M)
-    count = look_up(points, 1, pose, surface, resolution, seen)
-    return pose, cost_of(seen, count, len(points), LAST_SCALE_M)
+    count = look_up(points, pose, surface, resolution, work)
+    return pose, cost_of(work.seen, count, points.shape[1], LAST_SCALE_M)
 
 
 @numba.njit(cache=True)
@@ -235,10 +274,10 @@ def solve(h: Float, g: Float, damping: float) -> Float:
 
 @numba.njit(cache=True)
 def search(
-    points: Float, centre: Float, surface: Surface, resolution: float
+    points: Points, centre: Float, surface: Surface, resolution: float
 ) -> tuple[Float, float]:
     """Score a lattice of poses around a centre, refine the best few; best pose and its cost."""
-    stride = max(len(points) // SEARCH_POINTS, 1)
+    few = thinned(points, SEARCH_POINTS)
     best_costs = np.full(CANDIDATES, np.inf)
     best_poses = np.zeros((CANDIDATES, 3))
     pose = np.empty(3)
@@ -248,7 +287,7 @@ def search(
                 pose[0] = centre[0] + i * SEARCH_M
                 pose[1] = centre[1] + j * SEARCH_M
                 pose[2] = centre[2] + k * SEARCH_RAD
-                cost = robust_cost(points, stride, pose, surface, resolution, SEARCH_SCALE_M)
+                cost = robust_cost(few, pose, surface, resolution, SEARCH_SCALE_M)
                 worst = np.argmax(best_costs)
                 if cost < best_costs[worst]:
                     best_costs[worst] = cost
@@ -281,10 +320,10 @@ def register_each(
 
 @numba.njit(cache=True)
 def register_one(
-    points: Float, start: Float, surface: Surface, resolution: float, out: Float
+    points: Points, start: Float, surface: Surface, resolution: float, out: Float
 ) -> float:
     """Write the refined pose into `out` and return its cost, infinity where nothing was done."""
-    if len(points) == 0 or not np.isfinite(start).all():
+    if points.shape[1] == 0 or not np.isfinite(start).all():
         return np.inf
     pose, cost = register(points, start, surface, resolution)
     out[:] = pose
@@ -293,7 +332,7 @@ def register_one(
 
 @numba.njit(cache=True)
 def register(
-    points: Float, start: Float, surface: Surface, resolution: float
+    points: Points, start: Float, surface: Surface, resolution: float
 ) -> tuple[Float, float]:
     """Refine a start, and search around it where the cost stays high."""
     pose, cost = refine(points, start, surface, resolution, FIRST_SCALE_M)
@@ -368,10 +407,11 @@ def fit_each(
     """Say how every scan fits: rms distance of its inliers, and their share."""
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
-        if len(points) > 0 and np.isfinite(poses[n, 0]):
-            seen = np.empty((4, len(points)), np.float32)
-            count = look_up(points, 1, poses[n], surface, resolution, seen)
-            residual_m[n], inlier_ratio[n] = fit_quality(seen, count, len(points), inlier_m)
+        size = points.shape[1]
+        if size > 0 and np.isfinite(poses[n, 0]):
+            work = workspace(size)
+            count = look_up(points, poses[n], surface, resolution, work)
+            residual_m[n], inlier_ratio[n] = fit_quality(work.seen, count, size, inlier_m)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -391,11 +431,12 @@ def measure_each(
     """Say how every scan fits, and write the covariance (3, 3) of every pose that is known."""
     for n in numba.prange(ranges.shape[0]):
         points = base_points(ranges[n], use[n], directions, offset)
-        if len(points) > 0 and np.isfinite(poses[n, 0]):
-            seen = np.empty((4, len(points)), np.float32)
-            count = look_up(points, 1, poses[n], surface, resolution, seen)
-            residual_m[n], inlier_ratio[n] = fit_quality(seen, count, len(points), inlier_m)
-            found = weigh(seen, count, resolution, LAST_SCALE_M)
+        size = points.shape[1]
+        if size > 0 and np.isfinite(poses[n, 0]):
+            work = workspace(size)
+            count = look_up(points, poses[n], surface, resolution, work)
+            residual_m[n], inlier_ratio[n] = fit_quality(work.seen, count, size, inlier_m)
+            found = weigh(work.seen, count, resolution, LAST_SCALE_M)
             set_covariance(found, resolution, covariance[n])
 
 
