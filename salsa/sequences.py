@@ -269,7 +269,7 @@ def _help_on(job: Job, blocks: list[Block], parts: list[Alignment], run: Executo
     for number in range(1, len(blocks)):
         block, last = blocks[number], np.flatnonzero(parts[number - 1].accepted)
         known = np.isfinite(parts[number].poses).all(axis=-1)
-        if not len(last) or parts[number].accepted[known].all():
+        if not len(last) or parts[number].accepted.sum() > known.sum() / 2:
             continue
         at = blocks[number - 1].start + int(last[-1])
         before = np.stack((parts[number - 1].poses[last[-1]], rough_poses(reader, at, at + 1)[0]))
