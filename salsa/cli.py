@@ -130,15 +130,14 @@ def label(
 def _sightings(
     camera: Path | None, detections: str | None, names: Path | None, clock_offset_s: float
 ) -> Sightings | None:
-    from salsa.projection import Matching
-    from salsa.sightings import Sightings
+    from salsa.sightings import sightings_of
     from semantic2d_dataset.errors import InvalidInputError
 
     if camera is None and detections is None and names is None:
         return None
     if camera is None or detections is None:
         raise InvalidInputError("--camera and --detections need each other; give both")
-    return Sightings(camera, detections, names, Matching(clock_offset_s=clock_offset_s))
+    return sightings_of(camera, detections, names, clock_offset_s=clock_offset_s)
 
 
 @app.command(name="map")

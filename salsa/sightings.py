@@ -35,6 +35,13 @@ class Sightings:
     matching: Matching = DEFAULT_MATCHING
 
 
+def sightings_of(
+    camera: Path, detections: str, names: Path | None = None, *, clock_offset_s: float = 0.0
+) -> Sightings:
+    """Return sightings whose images were stamped by a clock of that offset, s."""
+    return Sightings(camera, detections, names, Matching(clock_offset_s=clock_offset_s))
+
+
 class Seen(NamedTuple):
     """A camera and what was detected in its images."""
 

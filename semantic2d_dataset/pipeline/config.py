@@ -18,6 +18,7 @@ from semantic2d_dataset.format.manifest import check_names
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.pipeline.siblings import load_sibling
 from semantic2d_dataset.scene.documents import read_yaml
+from semantic2d_dataset.scene.taxonomy import Taxonomy, read_taxonomy
 
 _FILE_OPTIONS = ("poses", "lidar")
 """Options of the conversion that may name a file."""
@@ -48,6 +49,10 @@ class RecordingConfig:
         `conversion.options.Options`, checked.
     salsa
         `salsa.sequences.Settings`, checked.
+    sightings
+        `salsa.sightings.Sightings` of its camera, or None.
+    taxonomy
+        Classes of the labels; None takes those of the sequence.
     drop
         A list of scans that belong to no split, see `semantic2d_dataset.pipeline.drops`.
     """
@@ -59,6 +64,8 @@ class RecordingConfig:
     annotation: Path
     convert: Any
     salsa: Any
+    sightings: Any
+    taxonomy: Taxonomy | None
     drop: Path | None
 
     @property
@@ -215,6 +222,10 @@ def _recordings(
             f"{said['recording']!r}; leave it out, or give each an entry of its own"
         )
     salsa = _settings(_merged(whole.get("salsa", {}), said.get("salsa", {})), f"{where}.salsa")
+    sightings = _sightings(said["camera"], f"{where}.camera", folder) if "camera" in said else None
+    taxonomy = (
+        read_taxonomy(_file(whole["taxonomy"], "taxonomy", folder)) if "taxonomy" in whole else None
+    )
     for paths in found:
         yield RecordingConfig(
             paths=paths,
@@ -231,6 +242,8 @@ def _recordings(
                 license=whole.get("license", "unknown"),
             ),
             salsa=salsa,
+            sightings=sightings,
+            taxonomy=taxonomy,
             drop=_file(said["drop"], f"{where}.drop", folder) if "drop" in said else None,
         )
 
@@ -293,6 +306,18 @@ def _settings(said: Mapping[str, Any], where: str) -> Any:
         return load_sibling("salsa", "settings").settings_from(said)
     except InvalidInputError as err:
         raise InvalidInputError(f"{where}: {str(err).removeprefix('salsa: ')}") from err
+
+
+def _sightings(said: Mapping[str, Any], where: str, folder: Path) -> Any:
+    at = said["detections"]
+    if not at.startswith("stream:"):
+        at = str(_file(at, f"{where}.detections", folder))
+    return load_sibling("salsa", "sightings").sightings_of(
+        _file(said["calibration"], f"{where}.calibration", folder),
+        at,
+        _file(said["names"], f"{where}.names", folder) if "names" in said else None,
+        clock_offset_s=float(said.get("clock_offset_s", 0.0)),
+    )
 
 
 def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

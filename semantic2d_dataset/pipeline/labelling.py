@@ -63,7 +63,14 @@ def find_labelled(
     if not present:
         return None
     salsa = load_sibling("salsa", "sequences")
-    facts = salsa.salsa_facts(source, recording.map_yaml, recording.annotation, recording.salsa)
+    facts = salsa.salsa_facts(
+        source,
+        recording.map_yaml,
+        recording.annotation,
+        recording.salsa,
+        recording.sightings,
+        recording.taxonomy,
+    )
     for place in present:
         if _provenance(place).get("salsa") == facts:
             return _describe(place, kept=True)
@@ -100,6 +107,8 @@ def label(
         recording.annotation,
         places[-1],
         settings=recording.salsa,
+        sightings=recording.sightings,
+        taxonomy=recording.taxonomy,
         force=True,
         executor=executor,
     )

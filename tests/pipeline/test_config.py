@@ -68,6 +68,29 @@ def test_what_is_said_of_all_holds_unless_one_says_otherwise(folder):
     assert [each.salsa.acceptance.max_residual_m for each in found] == [0.1, 0.1]
 
 
+def test_a_camera_and_other_classes_are_told_by_files(folder):
+    (folder / "classes.yaml").write_text("extends: semantic2d\nclasses: {Dog: [9, 9, 9]}")
+    for name in ("camera.yaml", "seen.json", "names.yaml"):
+        (folder / name).write_text("{}")
+    camera = {"calibration": "camera.yaml", "detections": "seen.json", "names": "names.yaml"}
+    (found,) = read(
+        folder,
+        taxonomy="classes.yaml",
+        recordings=recording(camera=camera | {"clock_offset_s": 2}),
+    ).recordings
+    assert found.taxonomy.names[-1] == "Dog"
+    assert found.sightings.camera == folder / "camera.yaml"
+    assert found.sightings.detections == str(folder / "seen.json")
+    assert found.sightings.names == folder / "names.yaml"
+    assert found.sightings.matching.clock_offset_s == 2
+    streamed = recording(camera=camera | {"detections": "stream:seen"})
+    (found,) = read(folder, recordings=streamed).recordings
+    assert found.sightings.detections == "stream:seen"
+    assert found.taxonomy is None
+    with pytest.raises(InvalidInputError, match=r"camera.detections: nothing is at .*none.json"):
+        read(folder, recordings=recording(camera=camera | {"detections": "none.json"}))
+
+
 def test_a_pose_file_is_relative_too(folder):
     (folder / "truth.tum").write_text("")
     (found,) = read(folder, recordings=recording(convert={"poses": "truth.tum"})).recordings

@@ -4,10 +4,11 @@ import pytest
 
 from semantic2d_dataset.errors import AlignmentError
 from semantic2d_dataset.executors import Serial
-from semantic2d_dataset.format.sequence import SequenceHeader, SequenceWriter
+from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
 from semantic2d_dataset.pipeline.config import RecordingConfig
 from semantic2d_dataset.pipeline.labelling import find_labelled, label
 from semantic2d_dataset.pipeline.siblings import load_sibling
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
 from tests.salsa import rooms
 
 SCANS = 12
@@ -29,8 +30,18 @@ def room(tmp_path_factory):
         )
     settings = load_sibling("salsa", "sequences").Settings()
     recording = RecordingConfig(
-        (folder / "a.bag",), "room", "a", *rooms.write_room(folder), None, settings, None
+        paths=(folder / "a.bag",),
+        environment="room",
+        name="a",
+        map_yaml=folder / "room.yaml",
+        annotation=folder / "room.json",
+        convert=None,
+        salsa=settings,
+        sightings=None,
+        taxonomy=None,
+        drop=None,
     )
+    rooms.write_room(folder)
     made = label(recording, folder / "a.h5", [folder / "none.h5", folder / "b.h5"], Serial())
     return recording, folder / "a.h5", made
 
@@ -50,6 +61,17 @@ def test_a_copy_that_is_there_is_kept_wherever_it_is(room, tmp_path):
     assert again == replace(made, kept=True)
     assert made.file.stat().st_mtime_ns == before
     assert not list(tmp_path.iterdir())
+
+
+def test_other_classes_label_anew(room, tmp_path):
+    recording, source, made = room
+    names, colours = (*SEMANTIC2D.names, "Dog"), (*SEMANTIC2D.colours, (9, 9, 9))
+    other = replace(recording, taxonomy=Taxonomy(names, colours))
+    assert find_labelled(other, source, [made.file]) is None
+    again = label(other, source, [tmp_path / "b.h5"], Serial())
+    with SequenceReader(again.file) as reader:
+        assert reader.header.taxonomy.names == names
+    assert find_labelled(other, source, [again.file]) == replace(again, kept=True)
 
 
 def test_a_copy_by_other_settings_or_of_another_map_or_damaged_is_not_it(room, tmp_path):
