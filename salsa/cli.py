@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from salsa.map_check import MapReport
     from salsa.sequences import Summary
     from salsa.sightings import Sightings
+    from semantic2d_dataset.scene.taxonomy import Taxonomy
+
+TaxonomyFile = Annotated[
+    Path | None, typer.Option("--taxonomy", help="Classes (YAML); the published ten if not given.")
+]
 
 app = typer.Typer(
     name="salsa",
@@ -151,6 +156,7 @@ def check_annotated_map(
     out: Annotated[
         Path | None, typer.Option(help="Label image (.png) of the annotation, to write.")
     ] = None,
+    taxonomy: TaxonomyFile = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON for a program to read.")
@@ -165,28 +171,30 @@ def check_annotated_map(
     from semantic2d_dataset.scene.maps import read_map
 
     _check_map_targets(map_yaml, annotation, plot, out, force=force)
+    classes = _classes(taxonomy)
     scene = read_map(map_yaml)
-    said = read_annotation(annotation, scene.occupancy.shape)
-    check_labelled(label_cells(scene, said.regions), map_yaml, annotation)
-    report = check_map(scene, said)
+    said = read_annotation(annotation, scene.occupancy.shape, classes)
+    check_labelled(label_cells(scene, said.regions, classes), map_yaml, annotation, classes)
+    report = check_map(scene, said, classes)
     typer.echo(
         json.dumps(asdict(report), indent=1)
         if as_json
         else _describe_map(report, map_yaml, annotation)
     )
     if out is not None:
-        write_label_image(out, said.regions)
+        write_label_image(out, said.regions, classes)
     if plot is not None:
         from salsa.map_pictures import plot_annotated_map
         from semantic2d_dataset.plotting import save
 
-        save(plot_annotated_map(scene, said, report), plot)
+        save(plot_annotated_map(scene, said, report, taxonomy=classes), plot)
 
 
 @app.command(name="labelmerc")
 def write_labelmerc(
     *,
     out: Annotated[Path, typer.Option(help="File to write.")] = Path(".labelmerc"),
+    taxonomy: TaxonomyFile = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
 ) -> None:
     """Write settings for labelme: the classes, their colours, and no other names."""
@@ -195,8 +203,14 @@ def write_labelmerc(
     from semantic2d_dataset.format.writing import write_text_atomically
 
     check_target(out, (), force=force)
-    write_text_atomically(out, labelmerc())
+    write_text_atomically(out, labelmerc(_classes(taxonomy)))
     typer.echo(f"{out}: written; annotate with: labelme --config {out} MAP_IMAGE")
+
+
+def _classes(path: Path | None) -> Taxonomy:
+    from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, read_taxonomy
+
+    return SEMANTIC2D if path is None else read_taxonomy(path)
 
 
 def _check_map_targets(

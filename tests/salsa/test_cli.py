@@ -241,3 +241,20 @@ def test_a_camera_and_its_detections_need_each_other(words):
         result = CliRunner().invoke(app, [*words, *option])
         assert isinstance(result.exception, InvalidInputError)
         assert "--camera and --detections need each other" in str(result.exception)
+
+
+def test_other_classes_reach_the_check_and_labelme(tmp_path):
+    rooms.write_room(tmp_path)
+    shapes = [*rooms.room_shapes(), rooms.shape("dog", rooms.pixel_box(rooms.BOXES["Pillar"]))]
+    rooms.write_labelme(tmp_path / "room.json", shapes)
+    (tmp_path / "classes.yaml").write_text("extends: semantic2d\nclasses: {Dog: [9, 9, 9]}")
+    words = ["map", str(tmp_path / "room.yaml"), str(tmp_path / "room.json")]
+    assert "no class: 'dog' in shape 5" in str(CliRunner().invoke(app, words).exception)
+    other = ["--taxonomy", str(tmp_path / "classes.yaml")]
+    result = CliRunner().invoke(app, [*words, *other, "--plot", str(tmp_path / "map.png")])
+    assert result.exit_code == 0, result.exception
+    assert "Dog" in result.output
+    out = tmp_path / "labelmerc"
+    result = CliRunner().invoke(app, ["labelmerc", "--out", str(out), *other])
+    assert result.exit_code == 0, result.exception
+    assert "Dog" in out.read_text(encoding="utf-8")
