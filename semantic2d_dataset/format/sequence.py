@@ -25,7 +25,7 @@ from semantic2d_dataset.scene.scans import ScanBatch
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED, Taxonomy
 
 _STAMPS_SOURCES = ("header", "record", "synthetic")
-_PART = re.compile(r"[a-z0-9]+(?:[-._]?[a-z0-9]+)*")
+_PART = re.compile(r"[a-z0-9]+(?:[-._][a-z0-9]+)*")
 _NOT_IN_DIGEST = {"format", "format_version", "generator", "created", "license"}
 
 

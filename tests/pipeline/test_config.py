@@ -134,6 +134,7 @@ WRONG = [
     ({"recordings": recording(paths="x")}, "recordings[0]: unknown key 'paths'; did you mean 'pa"),
     ({"recordings": recording(drop="no.txt")}, "recordings[0].drop: nothing is at {folder}/no.txt"),
     ({"recordings": recording(environment="My Lab")}, "such as 'my-lab'; found 'My Lab'"),
+    ({"recordings": recording(recording="a" * 60 + "B")}, "expected lower-case letters"),
     (
         {"recordings": recording(path="bags", recording="x")},
         "recordings[0].recording: 2 recordings cannot share the name 'x'",
