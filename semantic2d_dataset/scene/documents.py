@@ -21,6 +21,9 @@ _FAILURES = (
 )
 
 
+_MAX_VALUES = 1_000_000
+
+
 def read_yaml(path: Path, *, kind: str = "a YAML file", several: bool = False) -> Any:
     """Read a YAML document, which JSON is too, as plain values; None where the file is empty.
 
@@ -38,11 +41,27 @@ def read_yaml(path: Path, *, kind: str = "a YAML file", several: bool = False) -
     FileNotFoundError
         If there is no such file.
     InvalidInputError
-        If it is not YAML.
+        If it is not YAML, or would be endless or huge with its aliases written out.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-        return next(iter(yaml.safe_load_all(text)), None) if several else yaml.safe_load(text)
+        found = next(iter(yaml.safe_load_all(text)), None) if several else yaml.safe_load(text)
     except _FAILURES as err:
         said = " ".join(str(err).split())
         raise InvalidInputError(f"{path}: not {kind}: {said}") from err
+    if _count(found, {}) > _MAX_VALUES:
+        raise InvalidInputError(
+            f"{path}: not {kind}: its aliases stand for more than {_MAX_VALUES:,} values"
+        )
+    return found
+
+
+def _count(value: Any, known: dict[int, int]) -> int:
+    """Count the values of a document as if its aliases were written out, too many if endless."""
+    if not isinstance(value, (dict, list, tuple)):
+        return 1
+    if id(value) not in known:
+        known[id(value)] = _MAX_VALUES  # of itself, where it is a part of it
+        parts = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1 + sum(_count(part, known) for part in parts)
+    return known[id(value)]

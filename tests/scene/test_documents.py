@@ -38,3 +38,20 @@ def test_bytes_that_are_no_text_are_our_error_and_a_missing_file_is_python_s(tmp
         read_yaml(tmp_path / "a.yaml")
     with pytest.raises(FileNotFoundError):
         read_yaml(tmp_path / "none.yaml")
+
+
+BOMB = "\n".join(
+    ["a: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    + [f"b{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)]
+)
+
+
+@pytest.mark.parametrize("text", [BOMB, "a: &a [1, *a]", "a: &a {b: [*a]}"])
+def test_aliases_that_stand_for_too_much_are_refused(text, tmp_path):
+    with pytest.raises(InvalidInputError, match="its aliases stand for more than 1,000,000 values"):
+        read_yaml(written(tmp_path, text))
+
+
+def test_aliases_are_read_where_they_save_writing(tmp_path):
+    found = read_yaml(written(tmp_path, "a: &a {b: [1]}\nc: *a\nd: [*a, *a]"))
+    assert found == {"a": {"b": [1]}, "c": {"b": [1]}, "d": [{"b": [1]}, {"b": [1]}]}
