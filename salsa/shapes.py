@@ -193,7 +193,7 @@ def _read_outline(where: str, item: Any, size: tuple[int, ...]) -> _Outline:
             f"{where}: expected {_FEWEST_POINTS[kind]} or more finite points in a shape of type "
             f"{kind}, found {[list(point) for point in points]}"
         )
-    bitmap = _decode_bitmap(where, item) if kind == "mask" else None
+    bitmap = _decode_bitmap(where, item, size) if kind == "mask" else None
     outline = _Outline(str(name), kind, points, bitmap)
     _check_reach(where, outline, size)
     return outline
@@ -275,11 +275,15 @@ def _dot(canvas: ImageDraw.ImageDraw, x: float, y: float, radius: float) -> None
     canvas.ellipse((x - radius, y - radius, x + radius, y + radius), fill=1)
 
 
-def _decode_bitmap(where: str, item: Mapping[str, Any]) -> Image.Image:
-    """Return the bitmap that labelme stores with shapes of type mask."""
+def _decode_bitmap(where: str, item: Mapping[str, Any], size: tuple[int, ...]) -> Image.Image:
+    """Return the bitmap, a PNG cut out of the image, that labelme stores with shapes of type mask.
+
+    Its size is looked at before it is decompressed.
+    """
     try:
         data = base64.b64decode(item["mask"], validate=True)
-        with Image.open(io.BytesIO(data)) as mask:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as mask:
+            _check_bitmap(mask, size)
             return mask.convert("L").point(lambda value: 255 if value else 0)
     except (
         KeyError,
@@ -290,3 +294,10 @@ def _decode_bitmap(where: str, item: Mapping[str, Any]) -> Image.Image:
         Image.DecompressionBombError,
     ) as err:
         raise InvalidInputError(f"{where}: its mask cannot be read ({err!r})") from err
+
+
+def _check_bitmap(mask: Image.Image, size: tuple[int, ...]) -> None:
+    if mask.height > size[0] or mask.width > size[1]:
+        raise ValueError(
+            f"{mask.width} x {mask.height} pixels, more than the image of {size[1]} x {size[0]}"
+        )

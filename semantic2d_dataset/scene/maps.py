@@ -20,6 +20,9 @@ from semantic2d_dataset.scene.taxonomy import UNLABELLED
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255
 
+# Those of map servers; others, such as EPS, would be handed to a program of their own.
+_FORMATS = ("PPM", "PNG", "BMP", "GIF", "JPEG", "TIFF", "TGA", "PCX", "WEBP")
+
 
 @dataclass(frozen=True)
 class SemanticMap:
@@ -168,7 +171,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
 
 def _text(settings: dict[str, Any], key: str) -> str:
     value = settings[key]
-    if not isinstance(value, str):
+    if not isinstance(value, str) or "\0" in value:
         raise TypeError(f"{key} is no text")
     return value
 
@@ -181,7 +184,7 @@ def _read_image(path: Path) -> tuple[NDArray[np.unsignedinteger], int, NDArray[n
     if not path.is_file():
         raise FileNotFoundError(f"{path}: the image that the map names does not exist")
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=_FORMATS) as image:
             channels = 1 if image.mode in ("1", "L", "LA") else 3
             pixels = np.asarray(image.convert("LA" if channels == 1 else "RGBA"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:

@@ -218,3 +218,15 @@ def test_a_mask_of_other_letters_than_ascii_is_an_error(tmp_path):
     item = rooms.shape("Wall", [[0, 0], [4, 4]], "mask", mask="\u00e9")
     with pytest.raises(InvalidInputError, match="shape 1: its mask cannot be read"):
         drawn(tmp_path, item)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "says"),
+    [("PNG", (2000, 4), "2000 x 4 pixels, more than"), ("GIF", (4, 4), "cannot identify")],
+)
+def test_a_mask_larger_than_the_image_or_of_another_format_is_an_error(tmp_path, kind, size, says):
+    data = io.BytesIO()
+    Image.new("L", size).save(data, kind)
+    mask = base64.b64encode(data.getvalue()).decode()
+    with pytest.raises(InvalidInputError, match=f"shape 1: its mask cannot be read .*{says}"):
+        drawn(tmp_path, rooms.shape("Wall", [[0, 0], [4, 4]], "mask", mask=mask))

@@ -86,6 +86,7 @@ def test_cells_and_their_centres_agree_under_a_turned_origin(yaw):
         ({"negate": float("inf")}, "map.yaml: a map needs"),
         ({"resolution": float("inf")}, "map.yaml: expected a resolution"),
         ({"image": ["map.png"]}, "map.yaml: a map needs.*image is no text"),
+        ({"image": "a\0b"}, "map.yaml: a map needs.*image is no text"),
     ],
 )
 def test_bad_settings_are_named(settings, says, tmp_path):
@@ -104,6 +105,13 @@ def test_file_that_is_no_image_is_refused(content, tmp_path):
     path = write_files(tmp_path, [[0, 254]])
     (tmp_path / "map.png").write_bytes(content)
     with pytest.raises(InvalidInputError, match="not an image"):
+        read_map(path)
+
+
+def test_an_image_that_another_program_would_draw_is_not_opened(tmp_path):
+    path = write_files(tmp_path, [[0, 254]])
+    (tmp_path / "map.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 5 5\n")
+    with pytest.raises(InvalidInputError, match="cannot identify image file"):
         read_map(path)
 
 
