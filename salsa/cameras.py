@@ -180,11 +180,19 @@ def camera_files(path: Path) -> dict[str, Path]:
     Raises
     ------
     FileNotFoundError, InvalidInputError
-        If the first of them is missing, or not a mapping.
+        If the first of them is missing, or not a mapping, or names no file.
     """
     path = Path(path)
-    named = _read_mapping(path).get("camera_info")
-    return {"camera": path} | ({"camera_info": path.parent / str(named)} if named else {})
+    found = _read_mapping(path)
+    named = {"camera_info": _info_file(path, found)} if "camera_info" in found else {}
+    return {"camera": path} | named
+
+
+def _info_file(path: Path, found: Mapping[str, Any]) -> Path:
+    name = found["camera_info"]
+    if not isinstance(name, str) or "\0" in name:
+        raise InvalidInputError(f"{path}: camera_info: expected the name of a file, found {name!r}")
+    return path.parent / name
 
 
 def _own_camera(found: Mapping[str, Any], pose: Float, parent: str) -> Camera:
@@ -198,12 +206,10 @@ def _own_camera(found: Mapping[str, Any], pose: Float, parent: str) -> Camera:
 
 
 def _ros_camera(path: Path, found: Mapping[str, Any], pose: Float, parent: str) -> Camera:
-    if not isinstance(found["camera_info"], str):
-        raise InvalidInputError(f"{path}: camera_info: expected the name of a file")
     rectified = found.get("rectified", False)
     if not isinstance(rectified, bool):
         raise InvalidInputError(f"{path}: rectified: expected true or false, found {rectified!r}")
-    source = path.parent / found["camera_info"]
+    source = _info_file(path, found)
     said = _read_mapping(source)
     try:
         camera = _camera_of_info(said, pose, parent)

@@ -32,6 +32,7 @@ from salsa.blocks import (
     rough_poses,
     rows_of,
 )
+from salsa.detections import STREAM
 from salsa.evidence import Ledger, coarse
 from salsa.settings import Settings
 from salsa.sightings import Sightings, sighting_files
@@ -145,11 +146,13 @@ def label_sequence(
     facts = salsa_facts(source, map_yaml, annotation, settings, sightings, taxonomy)
     taxonomy = taxonomy or header.taxonomy
     files = [path.resolve() for path in (source, Path(map_yaml), Path(annotation))]
-    job = Job(files[0], files[1], files[2], sightings, taxonomy, settings, _digest(facts))
+    seen = None if sightings is None else sightings.resolved()
+    job = Job(files[0], files[1], files[2], seen, taxonomy, settings, _digest(facts))
     prepared, run = prepare(job), executor or Serial()
     reader = prepared.reader
     rough = rough_poses(reader, 0, len(reader))
     try:
+        _check_poses(source, rough)
         check_inside(rough, prepared.field)
         provenance = dict(header.provenance) | {"salsa": facts}
         header = replace(header, taxonomy=taxonomy, provenance=provenance)
@@ -206,7 +209,9 @@ def salsa_facts(
     inputs = input_files(source, map_yaml, annotation, sightings)
     parameters = asdict(settings or Settings()) | {"block_scans": BLOCK_SCANS}
     if sightings is not None:
-        parameters |= {"detections": sightings.detections, "matching": asdict(sightings.matching)}
+        parameters["matching"] = asdict(sightings.matching)
+        if sightings.detections.startswith(STREAM):
+            parameters["detections"] = sightings.detections
     if taxonomy is not None:
         parameters["taxonomy"] = asdict(taxonomy)
     facts = {
@@ -347,16 +352,19 @@ def _kept(reader: SequenceReader) -> list[str]:
     return [name for name in reader.names if not name.startswith(_OURS)]
 
 
+def _check_poses(source: Path, rough: NDArray[np.float64]) -> None:
+    if not np.isfinite(rough).all(axis=-1).any():
+        raise AlignmentError(
+            f"{source}: no scan has a pose, so alignment has nowhere to start; convert the "
+            f"recording with its amcl pose or tf"
+        )
+
+
 def _check_fit(
     source: Path, found: Alignment, moved_m: NDArray[np.float64], header: SequenceHeader
 ) -> None:
     """Refuse to call a recording from elsewhere a crowd."""
     known = np.isfinite(found.poses).all(axis=-1)
-    if not known.any():
-        raise AlignmentError(
-            f"{source}: no scan has a pose, so alignment has nowhere to start; convert the "
-            f"recording with its amcl pose or tf"
-        )
     if found.accepted.sum() < MIN_ACCEPTED_SHARE * known.sum():
         near, moved = np.median(found.inlier_ratio[known]), np.median(moved_m[known])
         raise AlignmentError(

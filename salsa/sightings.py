@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +33,16 @@ class Sightings:
     detections: str
     names: Path | None = None
     matching: Matching = DEFAULT_MATCHING
+
+    def resolved(self) -> Sightings:
+        """Return it with whole paths, for processes that work in other folders."""
+        source = self.detections
+        return replace(
+            self,
+            camera=self.camera.resolve(),
+            detections=source if source.startswith(STREAM) else str(Path(source).resolve()),
+            names=None if self.names is None else self.names.resolve(),
+        )
 
 
 def sightings_of(

@@ -183,6 +183,7 @@ POSE = {"base_T_camera": list(FORWARD)}
         (OWN | {"base_T_camera": [0, 0, 0, 0, 0, 0, 2]}, "length 1, found length 2"),
         (OWN | {"base_T_camera": [[1, 0, 0, 0]] * 4}, "a rotation and a translation"),
         (POSE | {"camera_info": 3}, "camera_info: expected the name of a file"),
+        (POSE | {"camera_info": "a\0b"}, "camera_info: expected the name of a file"),
         (POSE | {"camera_info": "info.yaml", "rectified": 1}, "expected true or false, found 1"),
         ([1], "camera.yaml: expected a mapping, found list"),
     ],

@@ -1,5 +1,8 @@
 import hashlib
 import json
+import os
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from salsa.sequences import label_sequence
 from salsa.settings import Settings
 from salsa.sightings import Sightings
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
-from semantic2d_dataset.executors import Processes
+from semantic2d_dataset.executors import Processes, Serial
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED, Taxonomy
 from tests.salsa import rooms
@@ -139,10 +142,13 @@ def test_scans_of_another_place_are_an_error_and_leave_nothing(room, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["source.h5"]
 
 
-def test_a_sequence_without_poses_is_an_error(room, tmp_path):
+@pytest.mark.parametrize("scans", [0, 3])
+def test_a_sequence_without_poses_is_an_error(room, scans, tmp_path):
     _, map_yaml, annotation = room
-    truth = rooms.true_poses(3)
-    write_source(tmp_path / "source.h5", rooms.batch_at(truth, np.full((3, 3), np.nan)))
+    batch = rooms.batch_at(rooms.true_poses(3), np.full((3, 3), np.nan))
+    rows = slice(0, scans)
+    kept = {name: getattr(batch, name)[rows] for name in ("ranges", "poses", "stamps_ns")}
+    write_source(tmp_path / "source.h5", replace(batch, **kept))
     with pytest.raises(AlignmentError, match="no scan has a pose"):
         label_sequence(tmp_path / "source.h5", map_yaml, annotation, tmp_path / "out.h5")
 
@@ -231,6 +237,36 @@ def write_camera(folder, stamps_ns, names=("dog",)):
     return Sightings(folder / "camera.yaml", str(folder / "seen.json"))
 
 
+class Elsewhere(Serial):
+    """Works in another folder, as the workers of a cluster do."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def map(self, function, items, **options):
+        blocks.prepare.cache_clear()
+        os.chdir(self.folder)
+        return super().map(function, items, **options)
+
+
+def test_relative_names_are_found_by_workers_in_other_folders(room, tmp_path, monkeypatch):
+    _, map_yaml, annotation = room
+    batch = rooms.batch_at(rooms.true_poses(4), rooms.true_poses(4))
+    write_source(tmp_path / "in.h5", batch)
+    write_camera(tmp_path, batch.stamps_ns, names=["person"])
+    monkeypatch.chdir(tmp_path)  # back at the end
+    (tmp_path / "elsewhere").mkdir()
+    label_sequence(
+        "in.h5",
+        os.path.relpath(map_yaml),
+        os.path.relpath(annotation),
+        tmp_path / "out.h5",
+        sightings=Sightings(Path("camera.yaml"), "seen.json"),
+        executor=Elsewhere(tmp_path / "elsewhere"),
+    )
+    assert (tmp_path / "out.h5").exists()
+
+
 def test_what_a_camera_saw_takes_its_class(room, tmp_path):
     _, map_yaml, annotation = room
     poses = np.repeat(np.array(((4.5, 3.5, -0.9),)), 10, axis=0)
@@ -248,6 +284,7 @@ def test_what_a_camera_saw_takes_its_class(room, tmp_path):
         assert reader.header.taxonomy == taxonomy
         said = reader.header.provenance["salsa"]
     assert {"camera", "detections"} <= set(said["inputs"])
+    assert str(tmp_path) not in json.dumps(said)
     with pytest.raises(InvalidInputError, match="detected classes 'dog' are not known"):
         label_sequence(*words, tmp_path / "no.h5", sightings=sightings)
     late = write_camera(tmp_path, batch.stamps_ns + 10**12)
