@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,8 +73,9 @@ def find_labelled(
         recording.taxonomy,
     )
     for place in present:
-        if _provenance(place).get("salsa") == facts:
-            return _describe(place, kept=True)
+        with suppress(Semantic2DError, OSError):  # one that is damaged is made anew
+            if _provenance(place).get("salsa") == facts:
+                return _describe(place, kept=True)
     return None
 
 
@@ -116,11 +118,8 @@ def label(
 
 
 def _provenance(file: Path) -> Mapping[str, Any]:
-    try:
-        with SequenceReader(file) as reader:
-            return reader.header.provenance
-    except (Semantic2DError, OSError):
-        return {}
+    with SequenceReader(file) as reader:
+        return reader.header.provenance
 
 
 def _describe(file: Path, *, kept: bool) -> Labelled:

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import h5py
 import pytest
 
 from semantic2d_dataset.errors import AlignmentError
@@ -87,6 +88,14 @@ def test_a_copy_by_other_settings_or_of_another_map_or_damaged_is_not_it(room, t
     damaged = tmp_path / "damaged.h5"
     damaged.write_bytes(made.file.read_bytes()[:5000])
     assert find_labelled(recording, source, [damaged, source]) is None
+    damaged.write_bytes(made.file.read_bytes())
+    with h5py.File(made.file) as file:
+        chunk = file["scans/labels"].id.get_chunk_info(0)
+    with damaged.open("r+b") as stream:
+        stream.seek(chunk.byte_offset + chunk.size // 2)
+        stream.write(b"\xff\x00\xff")
+    assert find_labelled(recording, source, [damaged]) is None
+    assert find_labelled(recording, source, [damaged, made.file]).file == made.file
 
 
 def test_what_does_not_fit_is_an_error_and_leaves_nothing(room, tmp_path):
