@@ -59,6 +59,8 @@ def read_settings(path: Path | None, changes: Mapping[str, Any]) -> Settings:
         raise InvalidInputError(f"{path}: {err}" if path else str(err)) from err
 
 
+_LARGEST = 2**31 - 1  # whole number, which no parameter comes near
+
 _STEPS: dict[str, type] = {
     "lines": LineParameters,
     "acceptance": Acceptance,
@@ -94,7 +96,7 @@ def _step(name: str, values: Any) -> Any:
     kind = _STEPS[name]
     if not isinstance(values, Mapping):
         raise InvalidInputError(f"salsa: {name}: expected a mapping, found {values!r}")
-    known = {each.name: each.default for each in fields(kind)}
+    known: dict[str, Any] = {each.name: each.default for each in fields(kind)}
     for key, value in values.items():
         if key not in known:
             raise InvalidInputError(f"salsa: {name}: {_unknown(key, list(known))}")
@@ -103,15 +105,14 @@ def _step(name: str, values: Any) -> Any:
                 f"salsa: {name}: {key}: expected a value like {known[key]!r}, found {value!r}"
             )
     start = getattr(Settings(), name) or kind()
-    changes = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
-    return replace(start, **changes)
+    return replace(start, **{key: type(known[key])(value) for key, value in values.items()})
 
 
 def _is_like(value: Any, example: Any) -> bool:
     if isinstance(example, tuple):
         return isinstance(value, list | tuple) and all(isinstance(each, str) for each in value)
-    if isinstance(example, float):
-        return isinstance(value, int | float) and not isinstance(value, bool)
+    if type(value) is int and isinstance(example, int | float) and not isinstance(example, bool):
+        return abs(value) <= _LARGEST
     return type(value) is type(example)
 
 

@@ -18,7 +18,7 @@ def test_what_is_said_takes_the_place_of_the_default():
         }
     )
     assert found.persistence == Persistence(min_seconds=9, movable=("Chair",))
-    assert found.acceptance.max_correction_m == 3
+    assert repr(found.acceptance.max_correction_m) == "3.0"  # a whole number is as good
     assert found.transfer.ignore_no_return
     assert settings_from({"persistence": None}).persistence is None
 
@@ -32,6 +32,8 @@ def test_what_is_said_takes_the_place_of_the_default():
         ({"transfer": {"ignore_no_return": 1}}, "expected a value like False, found 1"),
         ({"persistence": {"movable": "Chair"}}, "movable: expected a value like"),
         ({"persistence": {"min_seconds": 2.5}}, "min_seconds: expected a value like 5"),
+        ({"persistence": {"min_seconds": 10**400}}, "min_seconds: expected a value like 5"),
+        ({"lines": {"max_line_gap": 10**400}}, r"max_line_gap: expected a value like 1\.0"),
         ({"acceptance": None}, "acceptance: expected a mapping, found None"),
         ({"acceptance": {"inlier_m": 7.0}}, "acceptance limits"),
     ],
