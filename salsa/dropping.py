@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from salsa.sequences import check_target
+from salsa.sequences import check_target, sha256_of
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.format.drop_lists import format_ranges, parse_range, read_lines
 from semantic2d_dataset.format.schema import CHUNK_ROWS
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
@@ -21,7 +20,6 @@ from semantic2d_dataset.scene.taxonomy import UNLABELLED
 Indices = NDArray[np.int64]
 
 _BLOCK = 8 * CHUNK_ROWS  # scans
-_LINE = re.compile(r"(\d{1,18})(?:\s*-\s*(\d{1,18}))?", re.ASCII)
 _CLEARED = {"scans/labels": UNLABELLED, "scans/confidence": 0, "alignment/accepted": 0}
 
 
@@ -46,49 +44,10 @@ def read_drop_list(path: Path, scans: int) -> Indices:
     InvalidInputError
         If a line is neither, names a scan that there is not, or there is none to drop.
     """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as err:
-        raise InvalidInputError(f"{path}: expected a text file in UTF-8: {err}") from err
-    ranges = []
-    for number, line in enumerate(lines, start=1):
-        text = line.partition("#")[0].strip()
-        if text:
-            ranges.append(_range_of(text, scans, f"{path}, line {number}"))
+    ranges = [parse_range(text, scans, where) for where, text in read_lines(path)]
     if not ranges:
         raise InvalidInputError(f"{path}: names no scan to drop")
     return np.unique(np.concatenate([np.arange(first, last + 1) for first, last in ranges]))
-
-
-def _range_of(text: str, scans: int, where: str) -> tuple[int, int]:
-    match = _LINE.fullmatch(text)
-    if match is None:
-        raise InvalidInputError(
-            f"{where}: expected the index of a scan, such as 12, or a range, such as 12-30, "
-            f"found {text[:60]!r}"
-        )
-    first, last = int(match[1]), int(match[2] or match[1])
-    if last < first:
-        raise InvalidInputError(f"{where}: expected a range from low to high, found {text!r}")
-    if last >= scans:
-        raise InvalidInputError(
-            f"{where}: the sequence has {scans} scans, from 0 to {scans - 1}; found {text!r}"
-        )
-    return first, last
-
-
-def format_ranges(scans: ArrayLike) -> list[str]:
-    """Write indices as lines of a drop list.
-
-    >>> format_ranges([7, 3, 4, 5])
-    ['3-5', '7']
-    """
-    ordered = np.unique(np.asarray(scans, np.int64))
-    if not ordered.size:
-        return []
-    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
-    return [f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs]
 
 
 def dropped_before(reader: SequenceReader) -> NDArray[np.bool_]:
@@ -103,7 +62,7 @@ def dropped_before(reader: SequenceReader) -> NDArray[np.bool_]:
     try:
         drops = dict(reader.header.provenance.get("salsa", {})).get("dropped", [])
         for line in (line for drop in drops for line in drop["scans"]):
-            first, last = _range_of(line, len(reader), "salsa.dropped")
+            first, last = parse_range(line, len(reader), "salsa.dropped")
             mask[first : last + 1] = True
     except (KeyError, TypeError, ValueError) as err:
         raise CorruptFileError(f"{reader.path}: provenance: {err}") from err
@@ -143,7 +102,7 @@ def drop_scans(source: Path, scans: ArrayLike, out: Path, *, force: bool = False
             raise InvalidInputError(f"{source}: has no {', '.join(missing)}; label it first")
         dropped_before(reader)  # refuses a provenance that cannot be added to
         drop = {
-            "source": {"name": source.name, "sha256": _sha256(source)},
+            "source": {"name": source.name, "sha256": sha256_of(source)},
             "scans": format_ranges(np.flatnonzero(dropped)),
         }
         header = replace(reader.header, provenance=_with_drop(reader.header.provenance, drop))
@@ -199,8 +158,3 @@ def _others(reader: SequenceReader) -> list[str]:
         for name in reader.names
         if name not in _CLEARED and name != "provenance" and not name.startswith("map/")
     ]
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from salsa.dropping import format_ranges
 from salsa.inspection import Inspection, check_labelled, coverage, inspect_sequence
 from salsa.pictures import SLATE, Colours, Sheet
+from semantic2d_dataset.format.drop_lists import format_ranges
 from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.format.writing import write_text_atomically
 from semantic2d_dataset.scene.geometry import compose, invert, mount_in_plane

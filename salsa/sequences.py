@@ -216,7 +216,7 @@ def salsa_facts(
         parameters["taxonomy"] = asdict(taxonomy)
     facts = {
         "inputs": {
-            role: {"name": path.name, "sha256": _sha256(path)} for role, path in inputs.items()
+            role: {"name": path.name, "sha256": sha256_of(path)} for role, path in inputs.items()
         },
         "parameters": parameters,
         "versions": {
@@ -376,7 +376,8 @@ def _check_fit(
         )
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

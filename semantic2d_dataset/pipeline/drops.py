@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.format.drop_lists import parse_range, read_lines
 from semantic2d_dataset.format.splits import NONE, SplitScheme
-
-_LINE = re.compile(r"(?:(?P<id>\S+)\s+)?(?P<first>[0-9]+)(?:\s*-\s*(?P<last>[0-9]+))?")
 
 
 def read_drops(path: Path, lengths: Mapping[str, int]) -> dict[str, NDArray[np.int64]]:
@@ -38,39 +36,27 @@ def read_drops(path: Path, lengths: Mapping[str, int]) -> dict[str, NDArray[np.i
         If a line is no such line, or names a scan or a sequence that does not exist.
     """
     found: dict[str, list[NDArray[np.int64]]] = {}
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split("#")[0].strip()
-        if words:
-            name, indices = _scans(words, f"{path}:{number}", lengths)
-            found.setdefault(name, []).append(indices)
+    for where, text in read_lines(path):
+        name, scans = _divide(text, where, lengths)
+        first, last = parse_range(scans, lengths[name], where)
+        found.setdefault(name, []).append(np.arange(first, last + 1))
     return {name: np.unique(np.concatenate(parts)) for name, parts in found.items()}
 
 
-def _scans(words: str, where: str, lengths: Mapping[str, int]) -> tuple[str, NDArray[np.int64]]:
-    match = _LINE.fullmatch(words)
-    if match is None:
-        raise InvalidInputError(
-            f"{where}: expected the index of a scan (17), or of the first and the last (20-45), "
-            f"found {words!r}"
-        )
-    name = match["id"]
-    if name is None and len(lengths) > 1:
+def _divide(text: str, where: str, lengths: Mapping[str, int]) -> tuple[str, str]:
+    """Return the sequence that a line is about, and the scans of it."""
+    word, *rest = text.split(maxsplit=1)
+    if rest and (word in lengths or not word[0].isdigit()):
+        if word not in lengths:
+            raise InvalidInputError(
+                f"{where}: no sequence {word} of this recording; it has {', '.join(lengths)}"
+            )
+        return word, rest[0]
+    if len(lengths) != 1:
         raise InvalidInputError(
             f"{where}: expected the sequence before the scan, one of {', '.join(lengths)}"
         )
-    name = name or next(iter(lengths))
-    if name not in lengths:
-        raise InvalidInputError(
-            f"{where}: no sequence {name} of this recording; it has {', '.join(lengths)}"
-        )
-    first = int(match["first"])
-    last = int(match["last"] or first)
-    if not first <= last < lengths[name]:
-        raise InvalidInputError(
-            f"{where}: {name} has {lengths[name]} scans, 0 to {lengths[name] - 1}; found {words!r}"
-        )
-    return name, np.arange(first, last + 1)
+    return next(iter(lengths)), text
 
 
 def without(scheme: SplitScheme, dropped: Mapping[str, NDArray[np.int64]]) -> SplitScheme:

@@ -139,7 +139,7 @@ def test_splits_are_those_asked_for_and_leave_dropped_scans_out(rooms):
     assert not make(rooms, splits={"frame": {"seed": 7}}, **said).changed
     (rooms / "drop.txt").write_text("24\n")
     report = make(rooms, **said)
-    assert "has 24 scans, 0 to 23; found '24'" in report.rows[0].error
+    assert "has 24 scans, from 0 to 23; found '24'" in report.rows[0].error
 
 
 def test_another_version_is_published_of_what_is_there(rooms):
