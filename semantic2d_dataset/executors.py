@@ -234,21 +234,21 @@ class Processes(_Distributed):
         return next(task for task in waiting if task.future in done)
 
     def _result(self, task: _Task[Item, Result]) -> Result:
-        """Wait for a result; where a process died, try once more.
+        """Wait for a result; where a process died, try once more, in a process of its own.
 
-        One process that dies takes the items of all with it, so that none is to blame yet. The
-        second time each is waited for by itself.
+        One process that dies takes the items of all with it, so that none is to blame yet.
         """
         try:
             return task.future.result()  # type: ignore[no-any-return]
         except BrokenProcessPool:
             pass
-        try:
-            return self._submit(task.function, task.item).result()
-        except BrokenProcessPool as err:
-            raise WorkerLostError(
-                "a process was killed (is memory short?); run again to go on, with fewer jobs"
-            ) from err
+        with Processes(1) as alone:
+            try:
+                return alone._submit(task.function, task.item).result()
+            except BrokenProcessPool as err:
+                raise WorkerLostError(
+                    "a process was killed (is memory short?); run again to go on, with fewer jobs"
+                ) from err
 
 
 def _begin_worker(watched: Connection) -> None:
