@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -10,6 +9,7 @@ from typing import Any
 
 from conversion.messages.transforms import Mount
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.documents import hint
 
 STAMPS = ("auto", "header", "record")
 
@@ -110,9 +110,7 @@ def options_from(said: Mapping[str, Any]) -> Options:
     values = {}
     for name, value in said.items():
         if name not in kinds:
-            near = difflib.get_close_matches(str(name), kinds, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(kinds)}"
-            raise InvalidInputError(f"unknown option {name!r}; {hint}")
+            raise InvalidInputError(f"unknown option {name!r}{hint(name, kinds)}")
         values[name] = _plain(name, kinds[name], value)
     return Options(**values)
 

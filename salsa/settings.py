@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from salsa.labelling import DEFAULT_TRANSFER, Transfer
 from salsa.smoothing import Smoothing
 from salsa.things import DEFAULT_PERSISTENCE, Persistence
 from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.scene.documents import read_yaml
+from semantic2d_dataset.scene.documents import hint, read_yaml
 from semantic2d_dataset.scene.lines import FAST, LineParameters
 
 
@@ -90,7 +89,7 @@ def settings_from(values: Mapping[str, Any]) -> Settings:
 
 def _step(name: str, values: Any) -> Any:
     if name not in _STEPS:
-        raise InvalidInputError(f"salsa: {_unknown(name, list(_STEPS))}")
+        raise InvalidInputError(f"salsa: unknown key {name!r}{hint(name, _STEPS)}")
     if values is None and name in ("smoothing", "persistence"):
         return None
     kind = _STEPS[name]
@@ -99,7 +98,7 @@ def _step(name: str, values: Any) -> Any:
     known: dict[str, Any] = {each.name: each.default for each in fields(kind)}
     for key, value in values.items():
         if key not in known:
-            raise InvalidInputError(f"salsa: {name}: {_unknown(key, list(known))}")
+            raise InvalidInputError(f"salsa: {name}: unknown key {key!r}{hint(key, known)}")
         if not _is_like(value, known[key]):
             raise InvalidInputError(
                 f"salsa: {name}: {key}: expected a value like {known[key]!r}, found {value!r}"
@@ -114,9 +113,3 @@ def _is_like(value: Any, example: Any) -> bool:
     if type(value) is int and isinstance(example, int | float) and not isinstance(example, bool):
         return abs(value) <= _LARGEST
     return type(value) is type(example)
-
-
-def _unknown(name: object, known: list[str]) -> str:
-    near = get_close_matches(str(name), known, n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    return f"unknown key {name!r}{hint} (known are {', '.join(known)})"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.manifest import check_names
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.pipeline.siblings import load_sibling
-from semantic2d_dataset.scene.documents import read_yaml
+from semantic2d_dataset.scene.documents import hint, read_yaml
 from semantic2d_dataset.scene.taxonomy import Taxonomy, read_taxonomy
 
 _FILE_OPTIONS = ("poses", "lidar")
@@ -111,7 +110,7 @@ class Config:
         known = {name for each in self.recordings for name in (each.id, each.name)}
         for name in names:
             if name not in known:
-                raise InvalidInputError(f"{self.path}: no recording {name!r}{_hint(name, known)}")
+                raise InvalidInputError(f"{self.path}: no recording {name!r}{hint(name, known)}")
         return tuple(
             each for each in self.recordings if not names or {each.id, each.name} & {*names}
         )
@@ -177,7 +176,7 @@ def _in_words(where: str, error: Any) -> Iterator[str]:
         known = schema["properties"]
         for key in found:
             if key not in known:
-                yield f"{where}unknown key {key!r}{_hint(str(key), known)}"
+                yield f"{where}unknown key {key!r}{hint(key, known)}"
     elif error.validator == "required":
         key = next(key for key in error.validator_value if error.message.startswith(repr(key)))
         yield f"{where}expected the key {key!r}, which is missing"
@@ -199,20 +198,13 @@ def _in_words(where: str, error: Any) -> Iterator[str]:
         yield f"{where}{error.message}"
 
 
-def _hint(word: str, known: Collection[str]) -> str:
-    near = difflib.get_close_matches(word, known, n=1)
-    if near:
-        return f"; did you mean {near[0]!r}?"
-    return f"; known are {', '.join(sorted(known))}"
-
-
 def _recordings(
     said: Mapping[str, Any], where: str, whole: Mapping[str, Any], folder: Path
 ) -> Iterator[RecordingConfig]:
     """Yield every recording that an entry names."""
     maps = whole["maps"]
     if said["map"] not in maps:
-        raise InvalidInputError(f"{where}.map: no map {said['map']!r}{_hint(said['map'], maps)}")
+        raise InvalidInputError(f"{where}.map: no map {said['map']!r}{hint(said['map'], maps)}")
     at, scene = f"maps.{said['map']}", maps[said["map"]]
     environment = said.get("environment", slug(said["map"]))
     found = _find(said, where, folder)
@@ -345,8 +337,7 @@ def _check_environments(splits: Mapping[str, Any], environments: Collection[str]
         for name in names:
             if name not in environments:
                 raise InvalidInputError(
-                    f"splits.environment.{split}: no environment {name!r}"
-                    f"{_hint(name, environments)}"
+                    f"splits.environment.{split}: no environment {name!r}{hint(name, environments)}"
                 )
     if "environment" in splits and len(environments) < 3:
         raise InvalidInputError(

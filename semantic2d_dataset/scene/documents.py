@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -65,3 +67,14 @@ def _count(value: Any, known: dict[int, int]) -> int:
         parts = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_count(part, known) for part in parts)
     return known[id(value)]
+
+
+def hint(word: object, known: Collection[str]) -> str:
+    """Return the end of a message about an unknown word: what was meant, or what there is.
+
+    >>> hint("colour", ["color", "size"])
+    "; did you mean 'color'?"
+    """
+    names = sorted(map(str, known))
+    near = difflib.get_close_matches(str(word), names, n=1)
+    return f"; did you mean {near[0]!r}?" if near else f"; known are {', '.join(names)}"

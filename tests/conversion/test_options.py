@@ -34,7 +34,7 @@ def test_every_option_can_be_said():
     ("said", "says"),
     [
         ({"pose": "tf"}, "unknown option 'pose'; did you mean 'poses'"),
-        ({3: "tf"}, "unknown option 3; known are scan_topics, poses"),
+        ({3: "tf"}, "unknown option 3; known are base_frame, clock_offset_s"),
         ({"poses": None}, "poses: expected text, found None"),
         ({"scan_topics": "/scan"}, "scan_topics: expected a list of texts, found '/scan'"),
         ({"scan_topics": [1]}, r"scan_topics: expected a list of texts, found \[1\]"),

@@ -123,6 +123,10 @@ WRONG = [
         {"maps": {"room": {"map": "room.yaml", "annotation": "bags"}}},
         "maps.room.annotation: expected a file, found the folder {folder}/bags",
     ),
+    (
+        {"maps": {2024: {"map": "room.yaml", "annotation": "room.json"}}},
+        "maps: expected text, found 2024; quote it: '2024'",
+    ),
     ({"recordings": []}, "recordings: is empty"),
     ({"recordings": "monday.bag"}, "recordings: expected a list, found 'monday.bag'"),
     ({"recordings": recording(map="rom")}, "recordings[0].map: no map 'rom'; did you mean 'room'"),

@@ -26,8 +26,8 @@ def test_what_is_said_takes_the_place_of_the_default():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"persistance": {}}, "unknown key 'persistance'; did you mean persistence"),
-        ({"transfer": {"object": 0.1}}, "transfer: unknown key 'object'; did you mean object_m"),
+        ({"persistance": {}}, "unknown key 'persistance'; did you mean 'persistence'"),
+        ({"transfer": {"object": 0.1}}, "transfer: unknown key 'object'; did you mean 'object_m'"),
         ({"transfer": {"object_m": "near"}}, "object_m: expected a value like 0.15, found 'near'"),
         ({"transfer": {"ignore_no_return": 1}}, "expected a value like False, found 1"),
         ({"persistence": {"movable": "Chair"}}, "movable: expected a value like"),

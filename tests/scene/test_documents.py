@@ -1,7 +1,7 @@
 import pytest
 
 from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.scene.documents import read_yaml
+from semantic2d_dataset.scene.documents import hint, read_yaml
 
 
 def written(tmp_path, text):
@@ -38,6 +38,11 @@ def test_bytes_that_are_no_text_are_our_error_and_a_missing_file_is_python_s(tmp
         read_yaml(tmp_path / "a.yaml")
     with pytest.raises(FileNotFoundError):
         read_yaml(tmp_path / "none.yaml")
+
+
+def test_an_unknown_word_is_told_what_was_meant_or_what_there_is():
+    assert hint("pose", ["streams", "poses"]) == "; did you mean 'poses'?"
+    assert hint(3, {"streams": 1, "poses": 2}) == "; known are poses, streams"
 
 
 BOMB = "\n".join(
