@@ -16,24 +16,10 @@ from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, S
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
 from tests.conversion.detections import FOXY, HUMBLE, NOETIC, detection_drive
 from tests.generators import SMALL_LIDAR, make_arrays
+from tests.salsa.test_detection_files import DOG_BOX, OWN, START_NS
 
 TAXONOMY = Taxonomy((*SEMANTIC2D.names, "Dog"), (*SEMANTIC2D.colours, (120, 80, 20)))
 PERSON, DOG = TAXONOMY.id_of("Person"), TAXONOMY.id_of("Dog")
-START_NS = 1_700_000_000_000_000_000
-DOG_BOX = {"box": [10, 20.5, 30, 40], "class": "dog", "score": 0.75}
-OWN = {
-    "frames": [
-        {"stamp_ns": START_NS + 100, "detections": [DOG_BOX]},
-        {"stamp_ns": START_NS, "detections": []},
-        {
-            "stamp_ns": START_NS + 50,
-            "detections": [
-                {"box": [1, 2, 3, 4], "class": "person"},
-                {"box": [5, 6, 7, 8], "class": "dog", "score": 0.25},
-            ],
-        },
-    ]
-}
 
 
 @pytest.fixture(scope="module")
