@@ -112,11 +112,11 @@ def judge_block(job: Job, block: Block) -> Alignment:
     return judge(batch, poses, prepared.field, acceptance=acceptance)
 
 
-def gather_block(job: Job, block: Block) -> Evidence:
+def gather_block(job: Job, look_s: float, block: Block) -> Evidence:
     """Count what stays in free space and what does not."""
     prepared, found = prepare(job), aligned(block)
     batch = rough_batch(prepared.reader, block)
-    return gather(batch, found.poses, found.accepted, prepared.field)
+    return gather(batch, found.poses, found.accepted, prepared.field, look_s=look_s)
 
 
 def label_block(job: Job, things: Things, block: Block) -> tuple[Arrays, Counts]:

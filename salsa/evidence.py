@@ -68,20 +68,28 @@ def coarse(field: MapField) -> tuple[int, tuple[int, int]]:
     return ratio, (-(-rows // ratio), -(-columns // ratio))
 
 
+def look_length(stamps_ns: NDArray[np.int64]) -> float:
+    """Return how long a look takes, s: a second, or four scans (N,) of a slow lidar."""
+    periods = np.diff(stamps_ns / 1e9)
+    return max(LOOK_S, 4 * float(np.median(periods)) if len(periods) else 0.0)
+
+
 def gather(
-    batch: ScanBatch, poses: Float, accepted: NDArray[np.bool_], field: MapField
+    batch: ScanBatch,
+    poses: Float,
+    accepted: NDArray[np.bool_],
+    field: MapField,
+    *,
+    look_s: float = LOOK_S,
 ) -> Evidence:
     """Count what N scans in the order of time met; poses (N, 3) are those of the base.
 
-    Only scans that are accepted (N,) count. A look takes a second, or four scans of a slow lidar.
+    Only scans that are accepted (N,) count.
     """
     ratio, shape = coarse(field)
     beams = beams_of(batch, batch.valid & accepted[:, None])
     in_grid = compose(invert(field.origin.as_array()), poses)
-    seconds = (batch.stamps_ns - batch.stamps_ns[:1]) / 1e9
-    period_s = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
-    look_s = max(LOOK_S, 4 * period_s)
-    looks = seconds / look_s
+    looks = (batch.stamps_ns - batch.stamps_ns[:1]) / (1e9 * look_s)
     counts = np.zeros((6, *shape), np.int32)
     sums = np.zeros((3, *shape))
     stride = max(round(_STRIDE_RAD / batch.lidar.angle_increment), 1)
@@ -100,9 +108,12 @@ class Ledger:
     ----------
     shape
         Rows and columns of the coarse grid.
+    look_s
+        How long a look takes, s.
     """
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: tuple[int, int], look_s: float = LOOK_S) -> None:
+        self.look_s = look_s
         self.hits = np.zeros(shape, np.int64)
         self.met = np.zeros(shape, np.int32)
         self.held = np.zeros(shape, np.int32)

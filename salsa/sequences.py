@@ -33,7 +33,7 @@ from salsa.blocks import (
     rows_of,
 )
 from salsa.detections import STREAM
-from salsa.evidence import Ledger, coarse
+from salsa.evidence import Ledger, coarse, look_length
 from salsa.settings import Settings
 from salsa.sightings import Sightings, sighting_files
 from salsa.smoothing import read_odometry, smooth
@@ -274,7 +274,7 @@ def _help_on(job: Job, blocks: list[Block], parts: list[Alignment], run: Executo
     for number in range(1, len(blocks)):
         block, last = blocks[number], np.flatnonzero(parts[number - 1].accepted)
         known = np.isfinite(parts[number].poses).all(axis=-1)
-        if not len(last) or parts[number].accepted.sum() > known.sum() / 2:
+        if not len(last) or 2 * parts[number].accepted.sum() >= known.sum():
             continue
         at = blocks[number - 1].start + int(last[-1])
         before = np.stack((parts[number - 1].poses[last[-1]], rough_poses(reader, at, at + 1)[0]))
@@ -301,8 +301,9 @@ def _find_things(job: Job, found: Alignment, run: Executor) -> Things:
     persistence, field = job.settings.persistence, prepare(job).field
     if persistence is None:
         return NO_THINGS
-    ledger = Ledger(coarse(field)[1])
-    for evidence in run.map(partial(gather_block, job), _with_alignment(job, found)):
+    look_s = look_length(prepare(job).reader.read("scans/stamps_ns"))
+    ledger = Ledger(coarse(field)[1], look_s)
+    for evidence in run.map(partial(gather_block, job, look_s), _with_alignment(job, found)):
         ledger.add(evidence)
     object_m = job.settings.transfer.object_m
     return find_things(ledger, field, object_m, persistence, job.taxonomy)

@@ -147,10 +147,11 @@ _POSE_COLUMNS = tuple(
 
 def _motion_weights(motion: Float, seconds: Float, smoothing: Smoothing) -> Float:
     """Return inverse variances (N - 1, 3) of x, y and yaw of each step."""
-    way = np.hypot(motion[:, 0], motion[:, 1])
     drift = np.maximum(seconds, 1e-3)
-    metres = smoothing.motion_m**2 * drift + (smoothing.motion_share * way) ** 2
-    turn = smoothing.motion_rad**2 * drift + (smoothing.motion_share * motion[:, 2]) ** 2
+    with np.errstate(over="ignore"):  # a leap to nowhere has no weight
+        way = np.hypot(motion[:, 0], motion[:, 1])
+        metres = smoothing.motion_m**2 * drift + (smoothing.motion_share * way) ** 2
+        turn = smoothing.motion_rad**2 * drift + (smoothing.motion_share * motion[:, 2]) ** 2
     return 1.0 / np.stack((metres, metres, turn), axis=-1)
 
 

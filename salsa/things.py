@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from salsa.evidence import LOOK_S, Ledger, coarse
+from salsa.evidence import Ledger, coarse
 from salsa.fields import MapField
 from salsa.legs import Outline, find_standing, principal_axis
 from semantic2d_dataset.errors import InvalidInputError
@@ -122,7 +122,7 @@ def _staying(
 ) -> NDArray[np.bool_]:
     """Tell which coarse cells hold something in free space that stays."""
     looked = np.maximum(ledger.met + ledger.passed, 1)
-    stays = (ledger.met * LOOK_S >= persistence.min_seconds) & (
+    stays = (ledger.met * ledger.look_s >= persistence.min_seconds) & (
         ledger.met >= persistence.min_share * looked
     )
     rows, columns = np.nonzero(stays)

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from salsa.evidence import Ledger, coarse, gather
+from salsa.evidence import Ledger, coarse, gather, look_length
 from salsa.fields import map_field
 from tests.salsa import rooms
 
@@ -28,7 +28,9 @@ def watch(seconds, boxes_at, rate=20):
 def counted(batch, accepted=None):
     field = map_field(rooms.room_map())
     accepted = np.ones(len(batch), bool) if accepted is None else accepted
-    return Ledger(coarse(field)[1]).add(gather(batch, batch.poses, accepted, field))
+    look_s = look_length(batch.stamps_ns)
+    found = gather(batch, batch.poses, accepted, field, look_s=look_s)
+    return Ledger(coarse(field)[1], look_s).add(found)
 
 
 def edge_of(box):
@@ -61,7 +63,7 @@ def test_looks_do_not_depend_on_the_rate_of_the_lidar():
         found = counted(watch(3, lambda _: [BOX], rate))
         assert (found.met[edge_of(BOX)], found.held[edge_of(BOX)]) == (3, 3)
     slow = counted(watch(12, lambda _: [BOX], rate=1))  # a look takes four scans
-    assert (slow.met[edge_of(BOX)], slow.held[edge_of(BOX)]) == (3, 3)
+    assert (slow.met[edge_of(BOX)], slow.held[edge_of(BOX)], slow.look_s) == (3, 3, 4.0)
 
 
 def test_blocks_add_up_to_the_whole():

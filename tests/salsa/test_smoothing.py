@@ -62,6 +62,15 @@ def test_a_jump_of_the_rough_poses_bends_nothing():
     assert rooms.errors(found, truth)[0].max() < 0.03
 
 
+def test_a_leap_to_nowhere_has_no_say():
+    truth = rooms.true_poses(SCANS)
+    rough = truth.copy()
+    rough[60, 0] = 1e200
+    accepted = np.arange(SCANS) != 60
+    found = smooth(aligned(truth, accepted=accepted), rough, STAMPS, Smoothing())
+    assert rooms.errors(found[accepted], truth[accepted])[0].max() < 0.03
+
+
 def test_odometry_in_a_frame_of_its_own_tells_the_motion():
     truth = rooms.true_poses(SCANS)
     odometry = compose(np.array((5.0, -3.0, 2.0)), truth)
