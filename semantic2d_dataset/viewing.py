@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from semantic2d_dataset import plotting
-from semantic2d_dataset.errors import InvalidInputError, WriteError
+from semantic2d_dataset.errors import InvalidInputError, Semantic2DError, WriteError
 from semantic2d_dataset.format.schema import CHUNK_ROWS
 from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.format.writing import partial_name, remove_stale_partials
@@ -27,6 +29,7 @@ _POINT_PIXELS, _ROBOT_M = 4.0, 0.5
 _WAYS = {"poses/initial": (122, 127, 135), "poses/refined": (20, 87, 200)}
 _ROBOT_RGB = (214, 0, 127)  # no class is pink
 _ABOVE_MAP_M = 0.02
+_FREE_BYTES_KEPT = 1 << 27  # more than a block of scans takes
 
 
 def view_sequence(path: Path, *, every: int = 1, save: Path | None = None) -> int:
@@ -104,15 +107,28 @@ def _save(reader: SequenceReader, stream: Any, every: int, target: Path) -> int:
     remove_stale_partials(target)
     partial = partial_name(target)
     try:
+        partial.touch(exist_ok=False)
+        _check_space(target)
         stream.save(partial, default_blueprint=_from_above(reader))
-        shown = _send(reader, stream, every)
-        stream.flush()
+        shown = _send(reader, stream, every, after=lambda: _check_space(target))
         stream.disconnect()
         partial.replace(target)
+    except (OSError, RuntimeError) as err:
+        if isinstance(err, Semantic2DError):
+            raise
+        raise WriteError(f"{target}: could not be written: {err}") from err
     finally:
-        stream.disconnect()
         partial.unlink(missing_ok=True)
     return shown
+
+
+def _check_space(target: Path) -> None:
+    """Stop before the disk is full: Rerun does not tell, and waits for ever."""
+    free = shutil.disk_usage(target.parent).free
+    if free < _FREE_BYTES_KEPT:
+        raise WriteError(
+            f"{target}: the disk is full: {free} bytes are free; --every shows fewer scans"
+        )
 
 
 def _from_above(reader: SequenceReader) -> Any:
@@ -136,7 +152,10 @@ def _from_above(reader: SequenceReader) -> Any:
     return rrb.Blueprint(view, rrb.TimePanel(timeline=_TIMELINE), collapse_panels=True)
 
 
-def _send(reader: SequenceReader, stream: Any, every: int) -> int:
+def _send(
+    reader: SequenceReader, stream: Any, every: int, *, after: Callable[[], object] = lambda: None
+) -> int:
+    """Send all there is to see; `after` is called when a block of scans is sent."""
     scene = reader.read_map()
     _send_classes(stream, reader.header.taxonomy)
     if scene is not None:
@@ -154,6 +173,8 @@ def _send(reader: SequenceReader, stream: Any, every: int) -> int:
             if kept.size:
                 shown += _send_scans(stream, reader.batch(start, stop), kept, posed=posed)
             bar.update(stop - start)
+            after()
+    after()
     return shown
 
 

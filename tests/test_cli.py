@@ -247,6 +247,8 @@ def test_view_writes_a_recording_where_asked_to(run, tmp_path):
     status, out, _ = run("view", tmp_path / "a.h5", "--every", "3", "--save", tmp_path / "a.rrd")
     assert (status, out) == (0, f"wrote {tmp_path / 'a.rrd'}: 4 scans\n")
     assert (tmp_path / "a.rrd").read_bytes().startswith(b"RRF")
+    status, _, err = run("view", tmp_path / "a.h5", "--save", tmp_path / "a.rrd")
+    assert (status, "exists already" in err) == (1, True)
 
 
 def test_view_without_its_extra_says_how_to_get_it(run, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """What is sent to the viewer, read back from the recording that it would show."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -120,6 +121,15 @@ def test_what_fails_leaves_no_recording(sequence, rerun, tmp_path, monkeypatch):
         view_sequence(sequence[0], save=tmp_path / "out.rrd")
     assert [path.name for path in tmp_path.iterdir()] == ["out.rrd"]
     assert (tmp_path / "out.rrd").read_bytes() == b"old"
+
+
+def test_a_full_disk_is_told_before_it_is_full(sequence, rerun, tmp_path, monkeypatch):
+    left = iter((1 << 30, 1 << 30, 1 << 20))
+    monkeypatch.setattr(viewing, "_BLOCK", 64)
+    monkeypatch.setattr(viewing.shutil, "disk_usage", lambda _: SimpleNamespace(free=next(left)))
+    with pytest.raises(WriteError, match="out.rrd: the disk is full: 1048576 bytes are free"):
+        view_sequence(sequence[0], save=tmp_path / "out.rrd")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_viewer_is_opened_where_nothing_is_saved(sequence, rerun, monkeypatch):
