@@ -27,7 +27,7 @@ from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.scene.lines import extract_lines
 from semantic2d_dataset.scene.maps import SemanticMap
 from semantic2d_dataset.scene.scans import ScanBatch
-from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
+from semantic2d_dataset.scene.taxonomy import Taxonomy
 
 BLOCK_SCANS = 8 * CHUNK_ROWS
 """Scans in memory at a time; neighbours help each other within a block."""
@@ -125,8 +125,7 @@ def label_block(job: Job, things: Things, block: Block) -> tuple[Arrays, Counts]
     Returns
     -------
     arrays, counts
-        Arrays by their names in the sequence, and how many beams have each label (256,): those
-        with a return, and those that are left unlabelled.
+        Arrays by their names in the sequence, and how many points have each label (256,).
     """
     prepared, found = prepare(job), aligned(block)
     batch = rough_batch(prepared.reader, block)
@@ -165,7 +164,7 @@ def label_block(job: Job, things: Things, block: Block) -> tuple[Arrays, Counts]
         "lines/segments": segments,
         "lines/offsets": offsets,
     }
-    return arrays, np.bincount(labels[batch.valid | (labels == UNLABELLED)], minlength=256)
+    return arrays, np.bincount(labels[batch.valid], minlength=256)
 
 
 def aligned(block: Block) -> Alignment:

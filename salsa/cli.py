@@ -324,8 +324,8 @@ def _describe(summary: Summary, out: Path) -> str:
     ]
     if summary.things or summary.standing:
         lines.append(
-            f"unmapped and staying: {summary.things} things, {summary.things_moved} of them mapped "
-            f"objects that were moved; {summary.standing} legs or pairs of legs of people who stand"
+            f"unmapped and staying: {summary.things} thing(s), {summary.things_moved} of them "
+            f"mapped objects that were moved; {summary.standing} outline(s) of people who stand"
         )
     lines.append("points:")
     lines += [

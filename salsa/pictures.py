@@ -192,8 +192,13 @@ def _save(canvas: Colours, scene: SemanticMap, taxonomy: Taxonomy, picture: Path
     figure = Figure(figsize=(12, 2 + 10 * (top - bottom) / (right - left)), layout="constrained")
     FigureCanvasAgg(figure)
     ax = figure.add_subplot()
-    ax.imshow(canvas, origin="lower", extent=(0, width, 0, height), interpolation="nearest")
-    ax.set(xlim=(left, right), ylim=(bottom, top), xlabel="m", ylabel="m", facecolor="0.97")
+    x, y, yaw = scene.origin.as_array().tolist()
+    if yaw:  # the grid lies askew in the map frame: metres are from its corner
+        x, y = 0.0, 0.0
+    extent = (x, x + width, y, y + height)
+    ax.imshow(canvas, origin="lower", extent=extent, interpolation="nearest")
+    ax.set(xlim=(x + left, x + right), ylim=(y + bottom, y + top), facecolor="0.97")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
     rgb = np.array(taxonomy.colours) / 255
     handles = [
         Patch(facecolor=tuple(colour), edgecolor="0.25", label=name)

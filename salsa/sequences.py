@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -37,7 +38,7 @@ from salsa.evidence import Ledger, coarse, look_length
 from salsa.settings import Settings
 from salsa.sightings import Sightings, sighting_files
 from salsa.smoothing import read_odometry, smooth
-from salsa.things import NO_THINGS, Things, find_things
+from salsa.things import NO_THINGS, Things, find_things, movable_ids
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
 from semantic2d_dataset.executors import Executor, Serial
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
@@ -77,7 +78,8 @@ class Summary:
         Unmapped things that stay, how many of them are mapped objects that were moved, and how
         many outlines were taken for people who stand.
     points
-        Labelled beams by class name; beams of scans not accepted under ``unlabelled``.
+        Points (beams with a return) by class name; those of scans not accepted under
+        ``unlabelled``.
     """
 
     scans: int
@@ -145,6 +147,8 @@ def label_sequence(
         header = reader.header
     facts = salsa_facts(source, map_yaml, annotation, settings, sightings, taxonomy)
     taxonomy = taxonomy or header.taxonomy
+    if settings.persistence is not None:
+        movable_ids(settings.persistence, taxonomy)  # before hours of work
     files = [path.resolve() for path in (source, Path(map_yaml), Path(annotation))]
     seen = None if sightings is None else sightings.resolved()
     job = Job(files[0], files[1], files[2], seen, taxonomy, settings, _digest(facts))
@@ -247,6 +251,8 @@ def check_target(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
         raise InvalidInputError(f"{target}: exists already; choose another name or use --force")
     if not target.parent.is_dir():
         raise WriteError(f"{target}: the folder {target.parent} does not exist")
+    if not os.access(target.parent, os.W_OK):
+        raise WriteError(f"{target}: the folder {target.parent} cannot be written to")
 
 
 def _same(one: Path, other: Path) -> bool:
@@ -322,7 +328,7 @@ def _write_all(
     run: Executor,
     bar: tqdm[Any],
 ) -> NDArray[np.int64]:
-    """Write labels, lines and alignment, block by block; return beams per label (256,)."""
+    """Write labels, lines and alignment, block by block; return points per label (256,)."""
     counts = np.zeros(256, np.int64)
     lines = 0
     blocks = blocks_of(len(found))
@@ -356,8 +362,8 @@ def _kept(reader: SequenceReader) -> list[str]:
 def _check_poses(source: Path, rough: NDArray[np.float64]) -> None:
     if not np.isfinite(rough).all(axis=-1).any():
         raise AlignmentError(
-            f"{source}: no scan has a pose, so alignment has nowhere to start; convert the "
-            f"recording with its amcl pose or tf"
+            f"{source}: no scan has a pose, so alignment has nowhere to start; semantic2d inspect "
+            f"says which poses the recording has, and convert --poses takes them"
         )
 
 

@@ -20,7 +20,7 @@ from salsa.evidence import Ledger, coarse
 from salsa.fields import MapField
 from salsa.legs import Outline, find_standing, principal_axis
 from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED, Taxonomy
 
 Float = NDArray[np.float64]
 Labels = NDArray[np.uint8]
@@ -192,7 +192,7 @@ def _gone_objects(
     held = ndimage.maximum_filter(ledger.met, size=3)  # walls and poses are not exact
     gone = (ledger.passed >= _GONE_LOOKS) & (held < _STILL_SHARE * ledger.passed)
     middles, sizes, labels = [], [], []
-    for label in _ids_of(persistence.movable, taxonomy):
+    for label in movable_ids(persistence, taxonomy):
         mapped = _coarse_any((field.distance_m == 0) & (field.nearest_label == label), ratio, shape)
         numbers, count = _number(gone & mapped)
         for rows, columns in _groups(numbers, count):
@@ -204,12 +204,23 @@ def _gone_objects(
     return _Gone(np.array(middles).reshape(-1, 2), np.array(sizes), np.array(labels, np.uint8))
 
 
-def _ids_of(names: tuple[str, ...], taxonomy: Taxonomy) -> list[int]:
-    """Return the ids of those classes that the taxonomy has."""
+def movable_ids(persistence: Persistence, taxonomy: Taxonomy) -> list[int]:
+    """Return the ids of the movable classes; published ones that the taxonomy lacks are left out.
+
+    Raises
+    ------
+    InvalidInputError
+        If a name is neither in the taxonomy nor a published one.
+    """
     found = []
-    for name in names:
-        with suppress(InvalidInputError):
+    for name in persistence.movable:
+        try:
             found.append(taxonomy.id_of(name))
+        except InvalidInputError as err:
+            with suppress(InvalidInputError):
+                SEMANTIC2D.id_of(name)
+                continue
+            raise InvalidInputError(f"persistence: movable: {err}") from err
     return found
 
 

@@ -17,7 +17,7 @@ from semantic2d_dataset.format.manifest import check_names
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.pipeline.siblings import load_sibling
 from semantic2d_dataset.scene.documents import hint, read_yaml
-from semantic2d_dataset.scene.taxonomy import Taxonomy, read_taxonomy
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy, read_taxonomy
 
 _FILE_OPTIONS = ("poses", "lidar")
 """Options of the conversion that may name a file."""
@@ -143,6 +143,7 @@ def read_config(path: Path) -> Config:
             for recording in _recordings(each, f"recordings[{number}]", said, path.parent)
         )
         _check_distinct(recordings)
+        _check_maps(recordings)
         _check_environments(said.get("splits", {}), {each.environment for each in recordings})
     except InvalidInputError as err:
         raise InvalidInputError(f"{path}: {err}") from err
@@ -319,6 +320,15 @@ def _merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
         both = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
         merged[key] = _merged(base[key], value) if both else value
     return merged
+
+
+def _check_maps(recordings: Collection[RecordingConfig]) -> None:
+    """Read every map and its annotation, before hours of conversion."""
+    annotate_map = load_sibling("salsa", "annotation").annotate_map
+    for map_yaml, annotation, taxonomy in {
+        (each.map_yaml, each.annotation, each.taxonomy) for each in recordings
+    }:
+        annotate_map(map_yaml, annotation, taxonomy or SEMANTIC2D)
 
 
 def _check_distinct(recordings: Collection[RecordingConfig]) -> None:

@@ -30,6 +30,7 @@ from semantic2d_dataset.pipeline.report import Report, Row
 from semantic2d_dataset.pipeline.siblings import load_sibling
 
 _CONVERTED, _LABELLED = "converted", "labelled"
+_LOCK = ".lock"
 
 
 def run_pipeline(config: Config, executor: Executor, *, only: Collection[str] = ()) -> Report:
@@ -55,7 +56,7 @@ def run_pipeline(config: Config, executor: Executor, *, only: Collection[str] = 
         If the data set cannot be published.
     """
     recordings = config.select(only)
-    _check_name(config)
+    _check_out(config)
     with _alone(config.out / WORK):
         converted = _convert_all(config, recordings, executor)
         rows, dropped = _label_all(config, recordings, converted, executor)
@@ -85,7 +86,7 @@ def plan_pipeline(config: Config, *, only: Collection[str] = ()) -> list[dict[st
         If a name is unknown, or the folder holds another data set.
     """
     recordings = config.select(only)
-    _check_name(config)
+    _check_out(config)
     convert = load_sibling("conversion", "convert")
     said = []
     for each in recordings:
@@ -108,10 +109,29 @@ def _message(err: OSError, recording: RecordingConfig) -> str:
     return f"{err.filename or recording.paths[0]}: {(err.strerror or str(err)).lower()}"
 
 
-def _check_name(config: Config) -> None:
+def _check_out(config: Config) -> None:
+    """Refuse a folder that is somebody's: what does not belong to the data set is moved aside."""
+    if not config.out.is_dir():
+        return
+    inside = [
+        path
+        for each in config.recordings
+        for path in (*each.paths, each.map_yaml, each.annotation)
+        if path.resolve().is_relative_to(config.out.resolve())
+    ]
+    if inside:
+        raise InvalidInputError(
+            f"{config.out}: holds {inside[0]}, which is read; choose a folder of its own as 'out' "
+            f"in {config.path}"
+        )
     try:
         found = read_manifest(config.out).name
     except (DatasetNotFoundError, CorruptFileError):
+        if any(config.out.iterdir()) and not (config.out / WORK / _LOCK).exists():
+            raise InvalidInputError(
+                f"{config.out}: holds files, but no data set; choose a new or empty folder as "
+                f"'out' in {config.path}"
+            ) from None
         return
     if found != config.name:
         raise InvalidInputError(
@@ -128,7 +148,7 @@ def _alone(work: Path) -> Iterator[None]:
     except (FileExistsError, NotADirectoryError) as err:
         raise InvalidInputError(f"{work}: a file is in the way; choose another 'out'") from err
     try:
-        with FileLock(work / ".lock", timeout=0):
+        with FileLock(work / _LOCK, timeout=0):
             yield
     except Timeout as err:
         raise InvalidInputError(f"{work}: another run is at work there; wait for it") from err

@@ -91,6 +91,15 @@ def test_a_camera_and_other_classes_are_told_by_files(folder):
         read(folder, recordings=recording(camera=camera | {"detections": "none.json"}))
 
 
+def test_an_annotation_that_cannot_be_used_is_told_before_any_work(folder):
+    (folder / "bad.json").write_text(
+        (folder / "room.json").read_text().replace("Pillar", "Colum"), encoding="utf-8"
+    )
+    maps = {"room": {"map": "room.yaml", "annotation": "bad.json"}}
+    with pytest.raises(InvalidInputError, match="bad.json: labels that are no class: 'Colum'"):
+        read(folder, maps=maps)
+
+
 def test_a_pose_file_is_relative_too(folder):
     (folder / "truth.tum").write_text("")
     (found,) = read(folder, recordings=recording(convert={"poses": "truth.tum"})).recordings

@@ -229,6 +229,17 @@ def test_a_file_in_the_way_of_the_folder_is_told(rooms):
         make(rooms, out="room.json")
 
 
+def test_a_folder_of_somebody_s_is_not_taken_over(rooms):
+    with pytest.raises(InvalidInputError, match=r"holds .*, which is read; choose a folder of its"):
+        make(rooms, out=".")
+    (rooms / "mine" / "sequences").mkdir(parents=True)
+    (rooms / "mine" / "sequences" / "own.h5").write_bytes(b"mine")
+    with pytest.raises(InvalidInputError, match="mine: holds files, but no data set"):
+        make(rooms, out="mine")
+    assert (rooms / "mine" / "sequences" / "own.h5").read_bytes() == b"mine"
+    assert [path.name for path in (rooms / "mine").iterdir()] == ["sequences"]
+
+
 def test_several_processes_make_the_same_as_one(made, tmp_path):
     folder = tmp_path / "rooms"
     shutil.copytree(made[0], folder, ignore=shutil.ignore_patterns("data"))

@@ -12,6 +12,7 @@ from salsa.alignment import Acceptance
 from salsa.sequences import label_sequence
 from salsa.settings import Settings
 from salsa.sightings import Sightings
+from salsa.things import Persistence
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
 from semantic2d_dataset.executors import Processes, Serial
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
@@ -71,9 +72,11 @@ def test_a_labelled_sequence_holds_every_step_and_its_map(labelled):
         assert (np.diff(offsets) >= 4).all()
         assert offsets[-1] == len(segments)
         np.testing.assert_array_equal(reader.read_map().occupancy, rooms.room_map().occupancy)
+        valid = rooms.LIDAR.has_return(reader.read("scans/ranges"))
     assert summary.near_after > 0.95 > summary.near_before
     assert summary.points["Wall"] > 1000
-    assert summary.points["unlabelled"] == rooms.LIDAR.beams
+    assert summary.points["unlabelled"] == valid[5].sum()
+    assert sum(summary.points.values()) == valid.sum()
 
 
 def test_what_the_source_held_is_kept(room, labelled):
@@ -188,6 +191,16 @@ def test_without_persistence_nothing_is_gathered(room, tmp_path, monkeypatch):
     )
     with pytest.raises(TypeError):
         label_sequence(folder / "source.h5", map_yaml, annotation, tmp_path / "more.h5")
+
+
+def test_a_class_that_cannot_be_moved_is_named_before_any_work(room, tmp_path):
+    folder, map_yaml, annotation = room
+    words = folder / "source.h5", map_yaml, annotation, tmp_path / "out.h5"
+    settings = Settings(persistence=Persistence(movable=("Chiar",)))
+    with pytest.raises(InvalidInputError, match="persistence: movable: unknown class 'Chiar'"):
+        label_sequence(*words, settings=settings)
+    few = Taxonomy(("Other", "Person", *rooms.BOXES), ((0, 0, 0),) * (2 + len(rooms.BOXES)))
+    assert label_sequence(*words, taxonomy=few).scans_accepted == SCANS - 1  # no bins to move
 
 
 def test_a_drift_is_followed_from_block_to_block(room, tmp_path, monkeypatch):
