@@ -197,7 +197,8 @@ def _read_label_image(path: Path, shape: tuple[int, ...], taxonomy: Taxonomy) ->
 def _load_image(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], bool, bool]:
     """Pixels, whether they are ids, and whether 255 alone means that nothing was said."""
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: the annotation does not exist")
+        what = "is a folder, not a file" if path.is_dir() else "does not exist"
+        raise FileNotFoundError(f"{path}: the annotation {what}")
     try:
         image = Image.open(path, formats=_FORMATS)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as err:

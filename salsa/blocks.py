@@ -140,7 +140,7 @@ def label_block(job: Job, things: Things, block: Block) -> tuple[Arrays, Counts]
         taxonomy=job.taxonomy,
     )
     if prepared.seen is not None:
-        camera, detections, matching = prepared.seen
+        camera, detections, matching, _ = prepared.seen
         labels, confidence = apply_detections(
             batch,
             found.poses,

@@ -130,6 +130,8 @@ def label(
         from salsa.pictures import plot_labelled_sequence
 
         plot_labelled_sequence(out, plot)
+        if not as_json:
+            typer.echo(f"wrote {plot}")
 
 
 def _sightings(
@@ -327,6 +329,8 @@ def _describe(summary: Summary, out: Path) -> str:
             f"unmapped and staying: {summary.things} thing(s), {summary.things_moved} of them "
             f"mapped objects that were moved; {summary.standing} outline(s) of people who stand"
         )
+    if summary.scans_with_image is not None:
+        lines.append(f"scans with an image of the camera: {summary.scans_with_image}")
     lines.append("points:")
     lines += [
         f"  {name:<11}{count:>10}  {100 * count / total:5.1f} %"

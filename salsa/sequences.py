@@ -36,7 +36,7 @@ from salsa.blocks import (
 from salsa.detections import STREAM
 from salsa.evidence import Ledger, coarse, look_length
 from salsa.settings import Settings
-from salsa.sightings import Sightings, sighting_files
+from salsa.sightings import Seen, Sightings, sighting_files
 from salsa.smoothing import read_odometry, smooth
 from salsa.things import NO_THINGS, Things, find_things, movable_ids
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
@@ -77,6 +77,8 @@ class Summary:
     things, things_moved, standing
         Unmapped things that stay, how many of them are mapped objects that were moved, and how
         many outlines were taken for people who stand.
+    scans_with_image
+        Scans that a camera's image is near to; None where there was no camera.
     points
         Points (beams with a return) by class name; those of scans not accepted under
         ``unlabelled``.
@@ -91,6 +93,7 @@ class Summary:
     things: int
     things_moved: int
     standing: int
+    scans_with_image: int | None
     points: dict[str, int]
 
 
@@ -169,7 +172,7 @@ def label_sequence(
                 writer.copy(reader, _kept(reader))
                 counts = _write_all(job, writer, found, things, run, bar)
                 writer.set_map(prepared.scene)
-        return _summarise(found, near_before, things, counts, taxonomy)
+        return _summarise(found, near_before, things, prepared.seen, counts, taxonomy)
     finally:
         reader.close()
 
@@ -397,6 +400,7 @@ def _summarise(
     found: Alignment,
     near_before: NDArray[np.float32],
     things: Things,
+    seen: Seen | None,
     counts: NDArray[np.int64],
     taxonomy: Taxonomy,
 ) -> Summary:
@@ -412,5 +416,6 @@ def _summarise(
         things=things.things,
         things_moved=things.moved,
         standing=things.standing,
+        scans_with_image=None if seen is None else seen.scans,
         points={name: int(counts[label]) for label, name in names.items()},
     )

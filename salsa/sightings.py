@@ -53,11 +53,12 @@ def sightings_of(
 
 
 class Seen(NamedTuple):
-    """A camera and what was detected in its images."""
+    """A camera, what was detected in its images, and how many scans have an image."""
 
     camera: Camera
     detections: Detections
     matching: Matching
+    scans: int
 
 
 def sighting_files(sightings: Sightings | None) -> dict[str, Path]:
@@ -91,5 +92,5 @@ def read_sightings(
     source = at if at.startswith(STREAM) else Path(at)
     detections = read_detections(source, reader, taxonomy, names=names)
     matching, stamps_ns = sightings.matching, reader.read("scans/stamps_ns")
-    check_detections(stamps_ns, camera, detections, matching=matching, taxonomy=taxonomy)
-    return Seen(camera, detections, matching)
+    scans = check_detections(stamps_ns, camera, detections, matching=matching, taxonomy=taxonomy)
+    return Seen(camera, detections, matching, scans)

@@ -182,7 +182,8 @@ def _read_image(path: Path) -> tuple[NDArray[np.unsignedinteger], int, NDArray[n
     map_server averages the channels of a colour.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: the image that the map names does not exist")
+        what = "is a folder, not a file" if path.is_dir() else "does not exist"
+        raise FileNotFoundError(f"{path}: the image that the map names {what}")
     try:
         with Image.open(path, formats=_FORMATS) as image:
             channels = 1 if image.mode in ("1", "L", "LA") else 3

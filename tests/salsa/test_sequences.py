@@ -291,6 +291,7 @@ def test_what_a_camera_saw_takes_its_class(room, tmp_path):
     sightings = write_camera(tmp_path, batch.stamps_ns)
     seen = label_sequence(*words, tmp_path / "seen.h5", taxonomy=taxonomy, sightings=sightings)
     assert plain.points["Person"] > 50
+    assert (plain.scans_with_image, seen.scans_with_image) == (None, 10)
     assert (plain.points["Dog"], seen.points["Person"]) == (0, 0)
     assert seen.points["Dog"] == plain.points["Person"]
     with SequenceReader(tmp_path / "seen.h5") as reader:
