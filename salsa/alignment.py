@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from salsa import registration
 from salsa.features import points_near_lines
 from salsa.fields import MapField, as_field
-from salsa.registration import Beams, beams_of
+from salsa.residuals import Beams, beams_of
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError
 from semantic2d_dataset.scene.geometry import compose, invert, rotation_matrix, to_points
 from semantic2d_dataset.scene.lines import FAST, extract_lines

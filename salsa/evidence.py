@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from salsa.fields import MapField
-from salsa.registration import beams_of
+from salsa.residuals import beams_of
 from semantic2d_dataset.scene.geometry import compose, invert
 from semantic2d_dataset.scene.scans import ScanBatch
 

@@ -25,7 +25,7 @@ class MapField:
     surface
         (H, W, 4) f4: the same, interpolated bilinearly between the centres of cell (row, column)
         and its neighbours above and to the right: value at the cell's centre, change to the
-        right, change upward, and the change of these; see `salsa.registration`.
+        right, change upward, and the change of these; see `salsa.residuals`.
     nearest_label
         (H, W) u1: class of that occupied cell, 255 where it has none.
     border_m

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from salsa.fields import MapField, as_field, has_labels
-from salsa.registration import beams_of
+from salsa.residuals import beams_of
 from semantic2d_dataset.errors import AlignmentError, InvalidInputError
 from semantic2d_dataset.scene.geometry import compose, invert
 from semantic2d_dataset.scene.maps import SemanticMap
