@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from tests.conftest import PROJECT
 
 
 @contextmanager
@@ -20,12 +23,14 @@ def cluster(
     A nanny starts a worker again that died.
     """
     dask = Path(sys.executable).with_name("dask")
+    # functions of tests travel by name
+    known = os.environ | {"PYTHONPATH": str(PROJECT)}
     log = folder / "scheduler.log"
     started = []
     try:
         with log.open("wb") as stream:
             words = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-            started.append(subprocess.Popen([dask, *words], stderr=stream, cwd=folder))
+            started.append(subprocess.Popen([dask, *words], stderr=stream, cwd=folder, env=known))
         address = wait_for_address(log)
         for n in range(2):
             (folder / f"worker{n}").mkdir()
@@ -39,7 +44,10 @@ def cluster(
             ]
             started.append(
                 subprocess.Popen(
-                    [dask, *words], cwd=folder / f"worker{n}", stderr=subprocess.DEVNULL
+                    [dask, *words],
+                    cwd=folder / f"worker{n}",
+                    stderr=subprocess.DEVNULL,
+                    env=known,
                 )
             )
         yield address, started[1:]
