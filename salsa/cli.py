@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from salsa.sightings import Sightings
     from semantic2d_dataset.scene.taxonomy import Taxonomy
 
+Force = Annotated[bool, typer.Option("--force", help="Replace what exists.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 TaxonomyFile = Annotated[
     Path | None, typer.Option("--taxonomy", help="Classes (YAML); the published ten if not given.")
 ]
@@ -41,10 +43,8 @@ def label(
     map_yaml: Annotated[Path, typer.Option("--map", help="map_server YAML file.")],
     annotation: Annotated[Path, typer.Option(help="labelme JSON or label image of that map.")],
     out: Annotated[Path, typer.Option(help="Labelled sequence to write.")],
-    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON for a program to read.")
-    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
     settings: Annotated[
         Path | None, typer.Option(help="Parameters of all steps (YAML), see docs/salsa.md.")
     ] = None,
@@ -94,9 +94,10 @@ def label(
     ] = None,
 ) -> None:
     """Align a sequence with its map and write a labelled copy."""
-    from salsa.sequences import check_target, input_files, label_sequence
+    from salsa.sequences import input_files, label_sequence
     from salsa.settings import read_settings
     from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.format.writing import check_target
     from semantic2d_dataset.scene.taxonomy import read_taxonomy
 
     if plot is not None:  # before hours of work
@@ -159,10 +160,8 @@ def check_annotated_map(
         Path | None, typer.Option(help="Label image (.png) of the annotation, to write.")
     ] = None,
     taxonomy: TaxonomyFile = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON for a program to read.")
-    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check the annotation of a map, draw it, or turn it into a label image.
 
@@ -197,12 +196,11 @@ def write_labelmerc(
     *,
     out: Annotated[Path, typer.Option(help="File to write.")] = Path(".labelmerc"),
     taxonomy: TaxonomyFile = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+    force: Force = False,
 ) -> None:
     """Write settings for labelme: the classes, their colours, and no other names."""
     from salsa.labelmerc import labelmerc
-    from salsa.sequences import check_target
-    from semantic2d_dataset.format.writing import write_text_atomically
+    from semantic2d_dataset.format.writing import check_target, write_text_atomically
 
     check_target(out, (), force=force)
     write_text_atomically(out, labelmerc(_classes(taxonomy)))
@@ -219,8 +217,8 @@ def _check_map_targets(
     map_yaml: Path, annotation: Path, plot: Path | None, out: Path | None, *, force: bool
 ) -> None:
     """Refuse names that cannot be written before anything is read."""
-    from salsa.sequences import check_target
     from semantic2d_dataset.errors import InvalidInputError
+    from semantic2d_dataset.format.writing import check_target
     from semantic2d_dataset.plotting import check_picture_name
     from semantic2d_dataset.scene.maps import map_image
 
@@ -292,13 +290,13 @@ def review(
     cleaned: Annotated[
         Path | None, typer.Option(help="Copy without these scans to write; the page is of it.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
+    force: Force = False,
 ) -> None:
     """Write a page to judge labels by; drop the scans that were found wrong."""
     from salsa.dropping import drop_scans, read_drop_list
     from salsa.review import write_review
-    from salsa.sequences import check_target
     from semantic2d_dataset.format.sequence import SequenceReader
+    from semantic2d_dataset.format.writing import check_target
 
     if (drop is None) != (cleaned is None):
         raise typer.BadParameter("--drop and --cleaned belong together: which scans, and where to")

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from salsa.sequences import check_target, sha256_of
+from salsa.sequences import sha256_of
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.format.drop_lists import format_ranges, parse_range, read_lines
 from semantic2d_dataset.format.schema import CHUNK_ROWS
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
+from semantic2d_dataset.format.writing import check_target
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
 
 Indices = NDArray[np.int64]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -39,9 +38,10 @@ from salsa.settings import Settings
 from salsa.sightings import Seen, Sightings, sighting_files
 from salsa.smoothing import read_odometry, smooth
 from salsa.things import NO_THINGS, Things, find_things, movable_ids
-from semantic2d_dataset.errors import AlignmentError, InvalidInputError, WriteError
+from semantic2d_dataset.errors import AlignmentError
 from semantic2d_dataset.executors import Executor, Serial
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, SequenceWriter
+from semantic2d_dataset.format.writing import check_target
 from semantic2d_dataset.scene.maps import map_image
 from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
 
@@ -234,34 +234,6 @@ def salsa_facts(
         },
     }
     return dict(json.loads(json.dumps(facts)))  # as it is read back
-
-
-def check_target(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
-    """Check that a file can be written, and takes the place of nothing that is still needed.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is one of the inputs or a folder, or exists and `force` is not given.
-    WriteError
-        If its folder does not exist.
-    """
-    if any(_same(target, path) for path in inputs):
-        raise InvalidInputError(f"{target}: is an input itself; choose another name")
-    if target.is_dir():
-        raise InvalidInputError(f"{target}: is a folder; give the name of a file in it")
-    if target.exists() and not force:
-        raise InvalidInputError(f"{target}: exists already; choose another name or use --force")
-    if not target.parent.is_dir():
-        raise WriteError(f"{target}: the folder {target.parent} does not exist")
-    if not os.access(target.parent, os.W_OK):
-        raise WriteError(f"{target}: the folder {target.parent} cannot be written to")
-
-
-def _same(one: Path, other: Path) -> bool:
-    if one.exists() and other.exists():
-        return one.samefile(other)
-    return one.resolve() == other.resolve()
 
 
 def _align_all(job: Job, run: Executor, bar: tqdm[Any]) -> tuple[Alignment, NDArray[np.float32]]:

@@ -238,12 +238,11 @@ def view(
     force: Annotated[bool, typer.Option("--force", help="Replace what exists.")] = False,
 ) -> None:
     """Open a sequence in the Rerun viewer (extra 'view')."""
+    from semantic2d_dataset.format.writing import check_target
     from semantic2d_dataset.viewing import view_sequence
 
     if save is not None:
-        _check_page(save, sequence)
-        if save.exists() and not force:
-            raise InvalidInputError(f"{save}: exists already; choose another name or use --force")
+        check_target(save, (sequence,), force=force)
     shown = view_sequence(sequence, every=every, save=save)
     typer.echo(f"{'showing' if save is None else f'wrote {save}:'} {shown} scans")
 

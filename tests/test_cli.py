@@ -258,7 +258,7 @@ def test_view_without_its_extra_says_how_to_get_it(run, tmp_path, monkeypatch):
     assert (status, err.count("\n")) == (1, 1)
     assert "pip install 'semantic2d-dataset[view]'" in err
     status, _, err = run("view", tmp_path / "a.h5", "--save", tmp_path / "a.h5")
-    assert (status, "is the input itself" in err) == (1, True)
+    assert (status, "is an input itself" in err) == (1, True)
 
 
 def test_shadowing_does_not_stop_other_commands(tmp_path):

@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -128,19 +127,14 @@ class SequenceWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is None:
             try:
                 self._check_complete()
             except InvalidInputError:
                 self._container.abort()
                 raise
-        self._container.__exit__(kind, error, trace)
+        self._container.__exit__(kind, *error)
 
     def append(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Append rows to per-scan arrays (and to line features), in blocks of any size.

@@ -18,9 +18,8 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Self, cast
 
 import numpy as np
@@ -89,12 +88,7 @@ class ContainerWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self._send({"op": "commit"})
             self._finish()
@@ -205,6 +199,34 @@ class ContainerWriter:
     def _close_pipe(self) -> None:
         with contextlib.suppress(BrokenPipeError):
             self._pipe.close()
+
+
+def check_target(target: Path, inputs: Iterable[Path], *, force: bool) -> None:
+    """Check that a file can be written, and takes the place of nothing that is still needed.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is one of the inputs or a folder, or exists and `force` is not given.
+    WriteError
+        If its folder does not exist.
+    """
+    if any(_same(target, path) for path in inputs):
+        raise InvalidInputError(f"{target}: is an input itself; choose another name")
+    if target.is_dir():
+        raise InvalidInputError(f"{target}: is a folder; give the name of a file in it")
+    if target.exists() and not force:
+        raise InvalidInputError(f"{target}: exists already; choose another name or use --force")
+    if not target.parent.is_dir():
+        raise WriteError(f"{target}: the folder {target.parent} does not exist")
+    if not os.access(target.parent, os.W_OK):
+        raise WriteError(f"{target}: the folder {target.parent} cannot be written to")
+
+
+def _same(one: Path, other: Path) -> bool:
+    if one.exists() and other.exists():
+        return one.samefile(other)
+    return one.resolve() == other.resolve()
 
 
 def partial_name(path: Path) -> Path:
