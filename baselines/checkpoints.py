@@ -20,7 +20,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from baselines.s3net import S3Net
+from baselines.architectures import build_network, check_model
+from baselines.networks import SegmentationNetwork
 from semantic2d_dataset.access.features import Statistics, channel_count
 from semantic2d_dataset.errors import (
     CorruptFileError,
@@ -60,7 +61,7 @@ class Checkpoint:
         The settings of the training, and what it reached.
     """
 
-    network: S3Net
+    network: SegmentationNetwork
     features: str
     statistics: Statistics
     lidar: LidarSpec
@@ -78,7 +79,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
         If the folder is missing or the disk is full; the old checkpoint is then untouched.
     """
     network = checkpoint.network
-    architecture = {"name": "s3net", "channels": network.channels, "classes": network.classes}
+    architecture = {"name": network.name, "channels": network.channels, "classes": network.classes}
     parts = ("statistics", "lidar", "taxonomy")
     said = {
         "architecture": architecture,
@@ -213,8 +214,7 @@ def _read_tensors(path: Path, size: int, digest: str) -> dict[str, Tensor]:
 def _understand(said: Mapping[str, Any]) -> Checkpoint:
     """Build what a JSON file describes; the network has no weights yet."""
     architecture, features = said["architecture"], said["features"]
-    if architecture["name"] != "s3net":
-        raise InvalidInputError(f"unknown architecture {architecture['name']!r}; known is s3net")
+    check_model(architecture["name"])
     if channel_count(features) != architecture["channels"]:
         raise InvalidInputError(f"features {features} are not {architecture['channels']} channels")
     taxonomy = said["taxonomy"]
@@ -222,12 +222,12 @@ def _understand(said: Mapping[str, Any]) -> Checkpoint:
     if len(names) != architecture["classes"]:
         raise InvalidInputError(f"{len(names)} names for {architecture['classes']} classes")
     statistics = {key: tuple(values) for key, values in said["statistics"].items()}
-    lidar = said["lidar"] | {"base_T_lidar": tuple(said["lidar"]["base_T_lidar"])}
+    lidar = LidarSpec(**said["lidar"] | {"base_T_lidar": tuple(said["lidar"]["base_T_lidar"])})
     return Checkpoint(
-        S3Net(architecture["channels"], architecture["classes"]),
+        build_network(architecture["name"], architecture["channels"], len(names), lidar),
         features,
         Statistics(**statistics),
-        LidarSpec(**lidar),
+        lidar,
         Taxonomy(tuple(names), colours, taxonomy["background_id"]),
         dict(said["dataset"]),
         dict(said["training"]),

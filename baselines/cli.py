@@ -20,8 +20,6 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_MODELS = ("s3net",)
-
 Data = Annotated[str, typer.Option("--data", help="Name of a data set, or its folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print what was done as JSON.")]
 Device = Annotated[
@@ -48,18 +46,20 @@ def train(
     as_json: Json = False,
 ) -> None:
     """Train a model, and keep the epoch that does best on the validation split."""
-    _check_model(model)
+    from baselines import training
+    from baselines.architectures import check_model
+    from semantic2d_dataset.access.torch_datasets import load_dataset
+
+    check_model(model)
     _check_free(out / "model.json", force=force or resume)
     config = _config(
         preset,
+        model=model,
         features=features,
         epochs=epochs,
         time_limit_s=None if minutes is None else 60 * minutes,
         seed=seed,
     )
-    from baselines import training
-    from semantic2d_dataset.access.torch_datasets import load_dataset
-
     train_part, val_part = (
         load_dataset(data, lidar=lidar, split=split, scheme=scheme, features=config.features)
         for split in ("train", "val")
@@ -129,11 +129,6 @@ def predict(
     )
     said = {"predictions": str(out), "scans": count, "samples": samples}
     _report(said, f"{out}: {count} scans labelled by {samples} samples each", as_json=as_json)
-
-
-def _check_model(model: str) -> None:
-    if model not in _MODELS:
-        raise InvalidInputError(f"unknown model {model!r}; known are {', '.join(_MODELS)}")
 
 
 def _check_free(path: Path, *, force: bool) -> None:

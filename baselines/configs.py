@@ -18,6 +18,8 @@ class TrainingConfig:
 
     Parameters
     ----------
+    model
+        Name of the network, of `architectures.ARCHITECTURES`.
     features
         Letters of the input channels.
     epochs
@@ -43,6 +45,7 @@ class TrainingConfig:
         Stop after so many seconds; `schedule` then ends there too.
     """
 
+    model: str = "s3net"
     features: str = "RIA"
     epochs: int = 100
     batch_size: int = 1024

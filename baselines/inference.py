@@ -15,7 +15,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from baselines.checkpoints import Checkpoint
-from baselines.s3net import Latent, S3Net
+from baselines.networks import Latent, SegmentationNetwork
+from baselines.s3net import S3Net
 from baselines.steps import keep_freed_memory
 from semantic2d_dataset.access.torch_datasets import LidarDataset
 from semantic2d_dataset.errors import InvalidInputError
@@ -52,7 +53,7 @@ class SampledLabels:
 
 
 def infer(
-    network: S3Net, features: Tensor, *, samples: int = SAMPLES, seed: int = 0
+    network: SegmentationNetwork, features: Tensor, *, samples: int = SAMPLES, seed: int = 0
 ) -> SampledLabels:
     """Label scans by the majority of decoded samples of the latent.
 
@@ -63,7 +64,7 @@ def infer(
     features
         (N, C, B) f4, standardised.
     samples
-        Latents drawn for each scan, S.
+        Latents drawn for each scan, S; a network without a latent gives one sample, S = 1.
     seed
         Of the latents.
 
@@ -74,21 +75,38 @@ def infer(
     """
     if samples < 1:
         raise InvalidInputError(f"samples: expected at least 1, found {samples}")
-    beams = features.shape[-1]
-    noise = torch.Generator().manual_seed(seed)
     with torch.inference_mode():
-        laws = [network.encode(part) for part in torch.split(features, _ENCODED_AT_ONCE)]
-        law = Latent(*(torch.cat(parts) for parts in zip(*laws, strict=True)))
-        latents = _draw(law, samples, noise)  # (N, S, 1, L)
-        per_scan = [_decode_scan(network, drawn, beams) for drawn in latents]
-        chosen, votes, probabilities = (torch.stack(p) for p in zip(*per_scan, strict=True))
+        if isinstance(network, S3Net):
+            chosen, votes, probabilities = _sample(network, features, samples, seed)
+        else:
+            chosen, votes, probabilities = _label_once(network, features)
         entropy = torch.special.entr(probabilities).sum(2)
     return SampledLabels(
         votes.argmax(2).to(torch.uint8).numpy(force=True),
         probabilities.numpy(force=True),
         entropy.numpy(force=True),
-        chosen.transpose(0, 1).numpy(force=True),
+        chosen.numpy(force=True),
     )
+
+
+def _label_once(network: SegmentationNetwork, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return as `_sample` what a network without a latent gives: one sample of each scan."""
+    logits = [network.expected_logits(part) for part in torch.split(features, _ENCODED_AT_ONCE)]
+    probabilities = torch.cat(logits).softmax(1).transpose(1, 2)
+    return probabilities.argmax(2).to(torch.uint8)[None], probabilities, probabilities
+
+
+def _sample(
+    network: S3Net, features: Tensor, samples: int, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return labels (S, N, B) u1 of every sample, votes (N, B, K), mean probabilities (N, B, K)."""
+    noise = torch.Generator().manual_seed(seed)
+    laws = [network.encode(part) for part in torch.split(features, _ENCODED_AT_ONCE)]
+    law = Latent(*(torch.cat(parts) for parts in zip(*laws, strict=True)))
+    latents = _draw(law, samples, noise)  # (N, S, 1, L)
+    per_scan = [_decode_scan(network, drawn, features.shape[-1]) for drawn in latents]
+    chosen, votes, probabilities = (torch.stack(p) for p in zip(*per_scan, strict=True))
+    return chosen.transpose(0, 1), votes, probabilities
 
 
 def predict(

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from baselines.s3net import Prediction
+from baselines.networks import Prediction
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
 
 # Median frequency of each class over the Hokuyo training set, ids 0..9, as in the published
@@ -164,10 +164,13 @@ def _bin_weights(foreground: Tensor, background: Tensor) -> tuple[Tensor, Tensor
 def latent_divergence(prediction: Prediction) -> Tensor:
     """Return log q(z|x) - log p(z) of the latents decoded, summed over positions, mean over N.
 
-    One sample of the Kullback-Leibler divergence from the standard normal prior p.
+    One sample of the Kullback-Leibler divergence from the standard normal prior p; 0 for a
+    network without a latent.
     """
-    mean, log_sd = prediction.law
     z = prediction.latent
+    if z is None or prediction.law is None:
+        return prediction.logits.new_zeros(())
+    mean, log_sd = prediction.law
     log_ratio = 0.5 * (z.square() - ((z - mean) / log_sd.exp()).square()) - log_sd
     return log_ratio.sum() / z.shape[0]
 

@@ -6,43 +6,21 @@ The architecture and the parameter names are those of the published code
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from baselines.networks import Latent, Prediction, SegmentationNetwork
 from semantic2d_dataset.errors import InvalidInputError
 
 _HIDDEN = 64
 _RESIDUAL_HIDDEN = 32
 _RESIDUAL_LAYERS = 2
-_MIN_BEAMS = 4  # two halvings must leave one position
 
 
-class Latent(NamedTuple):
-    """A Gaussian for each of the L = B // 2 // 2 positions of a scan.
-
-    ``mean`` and ``log_sd`` are (N, 1, L) f4.
-    """
-
-    mean: Tensor
-    log_sd: Tensor
-
-    def sample(self) -> Tensor:
-        """Draw one latent (N, 1, L) from torch's random state."""
-        return self.mean + self.log_sd.exp() * torch.randn_like(self.mean)
-
-
-class Prediction(NamedTuple):
-    """What one pass gives: ``logits`` (N, K, B), the ``latent`` decoded (N, 1, L), and its law."""
-
-    logits: Tensor
-    latent: Tensor
-    law: Latent
-
-
-class S3Net(nn.Module):
+class S3Net(SegmentationNetwork):
     """The published network for any number of features, beams and classes.
 
     Parameters
@@ -53,10 +31,12 @@ class S3Net(nn.Module):
         Number of classes, K.
     """
 
+    name: ClassVar[str] = "s3net"
+    title: ClassVar[str] = "S3-Net"
+    least_beams: ClassVar[int] = 4  # two halvings must leave one position
+
     def __init__(self, channels: int = 3, classes: int = 10) -> None:
-        super().__init__()
-        self.channels = channels
-        self.classes = classes
+        super().__init__(channels, classes)
         self._encoder = _VariationalEncoder(channels)
         self._decoder_z_mu = _Widen(1, _HIDDEN, 1)
         self._decoder = _Decoder(classes)
@@ -69,11 +49,7 @@ class S3Net(nn.Module):
         InvalidInputError
             If the features have another shape.
         """
-        shape = tuple(features.shape)
-        if len(shape) != 3 or shape[1] != self.channels or shape[2] < _MIN_BEAMS:
-            raise InvalidInputError(
-                f"features: expected (N, {self.channels}, B) with B >= {_MIN_BEAMS}, found {shape}"
-            )
+        self.check_features(features)
         return Latent(*(head.squeeze(2) for head in self._encoder(_as_image(features))))
 
     def decode(self, latent: Tensor, beams: int) -> Tensor:
@@ -98,6 +74,10 @@ class S3Net(nn.Module):
         law = self.encode(features)
         chosen = law.sample() if latent is None else latent
         return Prediction(self.decode(chosen, features.shape[2]), chosen, law)
+
+    def expected_logits(self, features: Tensor) -> Tensor:
+        """Decode the mean of the latent of features (N, C, B) to logits (N, K, B)."""
+        return self.decode(self.encode(features).mean, features.shape[2])
 
 
 def _as_image(x: Tensor) -> Tensor:

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from baselines.losses import loss_terms
-from baselines.s3net import S3Net
+from baselines.networks import SegmentationNetwork
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # malloc.h
 _BATCH_NORM_MOMENTUM = 0.1  # torch's default, which the published network uses
 
 
 def step(
-    network: S3Net,
+    network: SegmentationNetwork,
     optimiser: torch.optim.Optimizer,
     batch: Mapping[str, Tensor],
     class_weights: Tensor,

@@ -1,4 +1,4 @@
-"""Train S3-Net: batches in, the epoch that validates best out."""
+"""Train a network: batches in, the epoch that validates best out."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from baselines.architectures import build_network
 from baselines.checkpoints import (
     Checkpoint,
     has_state,
@@ -27,7 +28,7 @@ from baselines.checkpoints import (
 )
 from baselines.configs import TrainingConfig, learning_rate_at
 from baselines.losses import median_frequency_weights
-from baselines.s3net import S3Net
+from baselines.networks import SegmentationNetwork
 from baselines.steps import keep_freed_memory, momentum_of_micro_batches, step
 from semantic2d_dataset.access.features import Statistics, channel_count
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
@@ -83,7 +84,7 @@ class TrainingResult:
 class _Run:
     """What changes while training."""
 
-    network: S3Net
+    network: SegmentationNetwork
     optimiser: torch.optim.Adam
     class_weights: Tensor
     log: list[dict[str, float]] = field(default_factory=list)
@@ -109,7 +110,7 @@ def train(
     resume: bool = False,
     about: Mapping[str, str] | None = None,
 ) -> TrainingResult:
-    """Train S3-Net and keep the epoch of the highest validation mIoU.
+    """Train a network and keep the epoch of the highest validation mIoU.
 
     Every epoch ends with complete files in `folder`: the best model (`load_checkpoint`),
     ``log.csv``, and the state to resume from. An interruption loses the epoch under way only.
@@ -162,15 +163,17 @@ def train(
     )
 
 
-def validate(network: S3Net, dataset: LabelledScans, *, batch_size: int = 32) -> float:
-    """Return the mIoU, a fraction, of labels decoded from the mean of the latent."""
+def validate(
+    network: SegmentationNetwork, dataset: LabelledScans, *, batch_size: int = 32
+) -> float:
+    """Return the mIoU, a fraction, of labels by the expected logits."""
     device = next(network.parameters()).device
     evaluator = Evaluator(dataset.taxonomy)
     network.eval()
     with torch.inference_mode():
         for batch in dataset.loader(batch_size, shuffle=False, seed=0):
             features = batch["features"].to(device)
-            logits = network.decode(network.encode(features).mean, features.shape[2])
+            logits = network.expected_logits(features)
             labels = logits.argmax(1).to("cpu", torch.uint8).numpy()
             truth = batch["label"].to(torch.uint8).numpy()
             evaluator.update(truth, labels, batch["valid"].numpy())
@@ -203,7 +206,8 @@ class _Clock:
 
 def _start(config: TrainingConfig, dataset: LabelledScans, device: torch.device) -> _Run:
     torch.manual_seed(config.seed)
-    network = S3Net(channel_count(config.features), len(dataset.taxonomy)).to(device)
+    channels, classes = channel_count(config.features), len(dataset.taxonomy)
+    network = build_network(config.model, channels, classes, dataset.lidar).to(device)
     momentum_of_micro_batches(network, config.batch_size, config.micro_batch)
     optimiser = torch.optim.Adam(
         network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True

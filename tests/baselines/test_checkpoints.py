@@ -122,7 +122,7 @@ def test_a_file_that_is_not_a_checkpoint_is_refused(folder: Path, text: str):
     [
         ({"format_version": "one"}, "format version"),
         ({"weights": None}, "does not say which weights"),
-        ({"architecture": {"name": "other"}}, "unknown architecture 'other'"),
+        ({"architecture": {"name": "other"}}, "unknown model 'other'"),
         ({"architecture": {"name": "s3net", "channels": 3}}, "classes"),
         ({"features": "RI"}, "are not 3 channels"),
         ({"features": 5}, "not the description"),

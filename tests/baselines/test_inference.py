@@ -10,7 +10,8 @@ from scipy import stats
 
 from baselines.checkpoints import Checkpoint
 from baselines.inference import infer, predict
-from baselines.s3net import Latent, S3Net
+from baselines.networks import Latent
+from baselines.s3net import S3Net
 from semantic2d_dataset import load_dataset, open_dataset
 from semantic2d_dataset.access.torch_datasets import LidarDataset
 from semantic2d_dataset.errors import InvalidInputError

@@ -15,7 +15,7 @@ from baselines.losses import (
     median_frequency_weights,
     weighted_cross_entropy,
 )
-from baselines.s3net import Latent, Prediction
+from baselines.networks import Latent, Prediction
 
 WEIGHTS = torch.tensor(HOKUYO_CLASS_WEIGHTS)
 
