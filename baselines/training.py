@@ -109,6 +109,7 @@ def train(
     device: str | torch.device | None = None,
     resume: bool = False,
     about: Mapping[str, str] | None = None,
+    initial: SegmentationNetwork | None = None,
 ) -> TrainingResult:
     """Train a network and keep the epoch of the highest validation mIoU.
 
@@ -131,11 +132,15 @@ def train(
         Go on where an earlier training in `folder` stopped, if there is one.
     about
         Name, version and scheme of the data set, to be kept with the model.
+    initial
+        Start from a copy of the weights of this network, to fine-tune it; from random ones where
+        not given.
 
     Raises
     ------
     InvalidInputError
-        If a data set is empty or they do not fit, or the training in `folder` had other settings.
+        If a data set is empty or they do not fit, the training in `folder` had other settings, or
+        `initial` is another network than is trained.
     WriteError
         If `folder` cannot be written.
     """
@@ -145,7 +150,7 @@ def train(
     Path(folder).mkdir(parents=True, exist_ok=True)
     forked = [torch.cuda.current_device()] if where.type == "cuda" else []
     with torch.random.fork_rng(forked):
-        run = _start(config, train_dataset, where)
+        run = _start(config, train_dataset, where, initial)
         if resume and has_state(folder, _RESUME):
             _restore(run, config, train_dataset, Path(folder))
         clock = _Clock(config, run.seconds)
@@ -204,16 +209,34 @@ class _Clock:
         return min(1.0, max(epochs / self.config.epochs, by_time))
 
 
-def _start(config: TrainingConfig, dataset: LabelledScans, device: torch.device) -> _Run:
+def _start(
+    config: TrainingConfig,
+    dataset: LabelledScans,
+    device: torch.device,
+    initial: SegmentationNetwork | None,
+) -> _Run:
     torch.manual_seed(config.seed)
     channels, classes = channel_count(config.features), len(dataset.taxonomy)
     network = build_network(config.model, channels, classes, dataset.lidar).to(device)
+    if initial is not None:
+        _copy_weights(initial, network)
     momentum_of_micro_batches(network, config.batch_size, config.micro_batch)
     optimiser = torch.optim.Adam(
         network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
     weights = median_frequency_weights(dataset.class_counts) ** config.class_weight_power
     return _Run(network, optimiser, weights.to(device))
+
+
+def _copy_weights(initial: SegmentationNetwork, network: SegmentationNetwork) -> None:
+    try:
+        network.load_state_dict(initial.state_dict())
+    except RuntimeError as err:
+        raise InvalidInputError(
+            f"cannot start a {network.name} with {network.channels} channels and "
+            f"{network.classes} classes from a {initial.name} with {initial.channels} and "
+            f"{initial.classes}"
+        ) from err
 
 
 def _train_epoch(

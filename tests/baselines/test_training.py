@@ -185,3 +185,18 @@ def test_empty_and_unlike_data_sets_are_refused(scans, tmp_path: Path):
         train(CONFIG, scans[0], other, tmp_path)
     with pytest.raises(InvalidInputError, match="features RI are 2 channels"):
         train(replace(CONFIG, features="RI"), *scans, tmp_path)
+
+
+def test_fine_tuning_starts_from_a_copy_of_the_initial_weights(
+    scans, trained: TrainingResult, tmp_path: Path
+):
+    initial = load_checkpoint(trained.folder).network
+    before = {name: value.clone() for name, value in initial.state_dict().items()}
+    still = replace(CONFIG, epochs=1, learning_rate=1e-12, weight_decay=0.0)
+    result = train(still, *scans, tmp_path / "still", initial=initial)
+    assert result.best_miou == pytest.approx(trained.best_miou, abs=0.05)
+    assert same(initial.state_dict(), before)
+    with pytest.raises(InvalidInputError, match="cannot start a s3net with 2 channels"):
+        fewer = ToyScans(8)
+        fewer.statistics = type(fewer.statistics)((0.0, 0.0), (1.0, 1.0))
+        train(replace(CONFIG, features="RI"), fewer, fewer, tmp_path / "other", initial=initial)
