@@ -145,6 +145,8 @@ def _config(preset: str, **changes: object) -> TrainingConfig:
     if preset not in PRESETS:
         raise InvalidInputError(f"unknown preset {preset!r}; known are {', '.join(PRESETS)}")
     given = {name: value for name, value in changes.items() if value is not None}
+    if "epochs" in given:  # a number of epochs is kept, whatever time they take
+        given.setdefault("time_limit_s", None)
     return replace(PRESETS[preset](), **given)  # type: ignore[arg-type]
 
 

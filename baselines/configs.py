@@ -41,6 +41,8 @@ class TrainingConfig:
         Median-frequency weights are raised to this power: 1 as published, 0 for equal classes.
     seed
         Of weights, order of scans and latents.
+    bf16
+        Let convolutions compute with 16 bits.
     time_limit_s
         Stop after so many seconds; `schedule` then ends there too.
     """
@@ -56,6 +58,7 @@ class TrainingConfig:
     betas: tuple[float, float, float] = (1.0, 1.0, 0.01)
     class_weight_power: float = 1.0
     seed: int = 0
+    bf16: bool = False
     time_limit_s: float | None = None
 
     def __post_init__(self) -> None:

@@ -6,32 +6,35 @@ import contextlib
 import ctypes
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 
 import torch
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from baselines.losses import loss_terms
-from baselines.networks import SegmentationNetwork
+from baselines.networks import Latent, Prediction
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # malloc.h
 _BATCH_NORM_MOMENTUM = 0.1  # torch's default, which the published network uses
 
 
 def step(
-    network: SegmentationNetwork,
+    network: nn.Module,
     optimiser: torch.optim.Optimizer,
     batch: Mapping[str, Tensor],
     class_weights: Tensor,
     *,
     betas: Sequence[float],
     micro_batch: int | None = None,
+    bf16: bool = False,
 ) -> dict[str, float]:
     """Take one step of the optimiser, and return the loss and its terms.
 
     Parameters
     ----------
     network, optimiser
-        Changed in place.
+        Changed in place. A `DistributedDataParallel` network averages gradients over its team.
     batch
         ``features`` (N, C, B) f4 and ``target`` (N, B) i8, 255 left out.
     class_weights
@@ -40,23 +43,44 @@ def step(
         Weights of the three terms.
     micro_batch
         Scans that go through the network at a time, their gradients averaged; None takes all.
-        Batch norms and Lovasz-softmax see one micro-batch each. For batches of 1,024 in parts of
-        32 to 256, running statistics stayed within 0.01 % and the loss within 2.4 to 0.2 %, but a
-        gradient was 18 to 7 % off, where merely drawing other latents makes 5 to 8 %.
+        Batch norms and Lovasz-softmax see one micro-batch each. For a batch of 1,024 Hokuyo scans
+        in parts of 32, the loss stayed within 0.6 % and the gradient within 2.9 %, where merely
+        drawing other latents changes it by 2.0 %.
+    bf16
+        Let convolutions compute with 16 bits; weights, losses and sums keep 32.
     """
     scans = len(batch["features"])
     sums: dict[str, float] = {}
     optimiser.zero_grad(set_to_none=True)
-    parts = (torch.split(batch[name], micro_batch or scans) for name in ("features", "target"))
-    for features, target in zip(*parts, strict=True):
-        terms = loss_terms(network(features), target, class_weights)
-        share = len(features) / scans
-        loss = terms.total(betas)
-        torch.autograd.backward(share * loss)
+    split = (torch.split(batch[name], micro_batch or scans) for name in ("features", "target"))
+    parts = list(zip(*split, strict=True))
+    for features, target in parts:
+        with _averaged_once(network, last=features is parts[-1][0]):
+            terms = loss_terms(_predict(network, features, bf16=bf16), target, class_weights)
+            share = len(features) / scans
+            loss = terms.total(betas)
+            torch.autograd.backward(share * loss)
         for name, value in {"loss": loss, **terms._asdict()}.items():
             sums[name] = sums.get(name, 0.0) + share * value.item()
     optimiser.step()
     return sums
+
+
+def _averaged_once(network: nn.Module, *, last: bool) -> AbstractContextManager[None]:
+    """Let a team average the sum of the micro-batches' gradients, and not each of them."""
+    if isinstance(network, DistributedDataParallel) and not last:
+        return network.no_sync()
+    return contextlib.nullcontext()
+
+
+def _predict(network: nn.Module, features: Tensor, *, bf16: bool) -> Prediction:
+    if not bf16:
+        return Prediction(*network(features))
+    with torch.autocast(features.device.type, torch.bfloat16):
+        logits, latent, law = network(features)
+    if latent is None:
+        return Prediction(logits.float())
+    return Prediction(logits.float(), latent.float(), Latent(*(part.float() for part in law)))
 
 
 def momentum_of_micro_batches(network: nn.Module, batch_size: int, micro_batch: int | None) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
@@ -30,6 +30,7 @@ from baselines.configs import TrainingConfig, learning_rate_at
 from baselines.losses import median_frequency_weights
 from baselines.networks import SegmentationNetwork
 from baselines.steps import keep_freed_memory, momentum_of_micro_batches, step
+from baselines.team import Team, join_team
 from semantic2d_dataset.access.features import Statistics, channel_count
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.format.writing import write_text_atomically
@@ -87,6 +88,7 @@ class _Run:
     network: SegmentationNetwork
     optimiser: torch.optim.Adam
     class_weights: Tensor
+    team: Team
     log: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -116,7 +118,8 @@ def train(
     Every epoch ends with complete files in `folder`: the best model (`load_checkpoint`),
     ``log.csv``, and the state to resume from. An interruption loses the epoch under way only.
     On one machine, the same seed gives the same model, resumed or not, unless a time limit ends
-    it: the schedule follows the clock then.
+    it: the schedule follows the clock then. Under torchrun, each process takes its share of every
+    batch, and the gradients are averaged; batch norms see the own share.
 
     Parameters
     ----------
@@ -149,18 +152,22 @@ def train(
     keep_freed_memory()
     Path(folder).mkdir(parents=True, exist_ok=True)
     forked = [torch.cuda.current_device()] if where.type == "cuda" else []
-    with torch.random.fork_rng(forked):
-        run = _start(config, train_dataset, where, initial)
+    with join_team(where) as team, torch.random.fork_rng(forked):
+        _check_team(team, config, len(train_dataset))
+        run = _start(config, train_dataset, where, initial, team)
         if resume and has_state(folder, _RESUME):
             _restore(run, config, train_dataset, Path(folder))
         clock = _Clock(config, run.seconds)
-        with _progress_bar() as bar:
+        network = team.wrap(run.network)
+        with _progress_bar(team) as bar:
             while not clock.is_over(len(run.log)):
-                row = _train_epoch(run, train_dataset, config, clock, bar)
-                row["val_miou"] = validate(run.network, val_dataset)
+                row = _train_epoch(run, network, train_dataset, config, clock, bar)
+                found = validate(run.network, val_dataset) if team.rank == 0 else 0.0
+                row["val_miou"] = team.tell(found, where)
                 run.seconds = row["seconds"] = clock.elapsed
                 run.log.append(row)
-                _save(run, config, train_dataset, Path(folder), about or {})
+                if team.rank == 0:
+                    _save(run, config, train_dataset, Path(folder), about or {})
                 bar.set_postfix(mIoU=f"{row['val_miou']:.3f}", loss=f"{row['loss']:.1f}")
     best = run.best
     return TrainingResult(
@@ -214,6 +221,7 @@ def _start(
     dataset: LabelledScans,
     device: torch.device,
     initial: SegmentationNetwork | None,
+    team: Team,
 ) -> _Run:
     torch.manual_seed(config.seed)
     channels, classes = channel_count(config.features), len(dataset.taxonomy)
@@ -225,7 +233,7 @@ def _start(
         network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
     weights = median_frequency_weights(dataset.class_counts) ** config.class_weight_power
-    return _Run(network, optimiser, weights.to(device))
+    return _Run(network, optimiser, weights.to(device), team)
 
 
 def _copy_weights(initial: SegmentationNetwork, network: SegmentationNetwork) -> None:
@@ -240,12 +248,17 @@ def _copy_weights(initial: SegmentationNetwork, network: SegmentationNetwork) ->
 
 
 def _train_epoch(
-    run: _Run, dataset: LabelledScans, config: TrainingConfig, clock: _Clock, bar: tqdm[Any]
+    run: _Run,
+    network: nn.Module,
+    dataset: LabelledScans,
+    config: TrainingConfig,
+    clock: _Clock,
+    bar: tqdm[Any],
 ) -> dict[str, float]:
     """Train one epoch, cut short where the time is up; return its row of the log."""
     done = len(run.log)
     seed = _seed_of_epoch(config, done)
-    torch.manual_seed(seed)
+    torch.manual_seed(seed + run.team.rank)
     loader = dataset.loader(config.batch_size, shuffle=True, seed=seed)
     sums: dict[str, float] = {}
     scans, rate = 0, 0.0
@@ -255,13 +268,16 @@ def _train_epoch(
         for group in run.optimiser.param_groups:
             group["lr"] = rate
         count = len(batch["label"])
+        if count < run.team.size:
+            continue  # the few scans of a last batch do not go round
         terms = step(
-            run.network,
+            network,
             run.optimiser,
-            _to(batch, run.device),
+            run.team.share(_to(batch, run.device)),
             run.class_weights,
             betas=config.betas,
             micro_batch=config.micro_batch,
+            bf16=config.bf16,
         )
         for name, value in terms.items():
             sums[name] = sums.get(name, 0.0) + count * value
@@ -285,6 +301,15 @@ def _seed_of_epoch(config: TrainingConfig, epoch: int) -> int:
 def _to(batch: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     target = batch["label"].masked_fill(~batch["valid"], UNLABELLED)
     return {"features": batch["features"].to(device), "target": target.to(device)}
+
+
+def _check_team(team: Team, config: TrainingConfig, scans: int) -> None:
+    if scans < team.size:
+        raise InvalidInputError(f"{scans} scans are too few for {team.size} processes")
+    if team.size > 1 and config.time_limit_s is not None:
+        raise InvalidInputError(
+            f"{team.size} processes cannot keep one time limit; say how many epochs instead"
+        )
 
 
 def _check_datasets(config: TrainingConfig, *datasets: LabelledScans) -> None:
@@ -361,10 +386,10 @@ def _restore(run: _Run, config: TrainingConfig, dataset: LabelledScans, folder: 
     run.log, run.seconds = log, seconds
 
 
-def _progress_bar() -> tqdm[Any]:
+def _progress_bar(team: Team) -> tqdm[Any]:
     return tqdm(
         total=1.0,
         desc="training",
         bar_format="{desc} {percentage:3.0f}% |{bar}| {elapsed}<{remaining}{postfix}",
-        disable=None,
+        disable=None if team.rank == 0 else True,
     )
