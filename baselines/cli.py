@@ -29,7 +29,7 @@ Device = Annotated[
 
 @app.command()
 def train(
-    model: Annotated[str, typer.Argument(help="What to train: s3net.")],
+    model: Annotated[str, typer.Argument(help="What to train: s3net or unet.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the model and its log.")],
     data: Data = "semantic2d-mini",
     lidar: Annotated[str, typer.Option(help="Whose scans to train on.")] = "hokuyo",
