@@ -1,4 +1,4 @@
-"""The commands ``semantic2d baseline train`` and ``semantic2d baseline predict``."""
+"""The commands ``semantic2d baseline train``, ``predict`` and ``import``."""
 
 from __future__ import annotations
 
@@ -129,6 +129,54 @@ def predict(
     )
     said = {"predictions": str(out), "scans": count, "samples": samples}
     _report(said, f"{out}: {count} scans labelled by {samples} samples each", as_json=as_json)
+
+
+@app.command(name="import")
+def import_weights(
+    file: Annotated[Path, typer.Argument(help="A .pth file of the published code.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the model.")],
+    lidar: Annotated[str, typer.Option(help="Whose scans the network takes.")] = "hokuyo",
+    features: Annotated[str, typer.Option(help="Letters of R, I, P, A.")] = "RIA",
+    data: Annotated[
+        str | None,
+        typer.Option(
+            "--data",
+            help="Data set whose training split gives lidar, classes and statistics; the "
+            "published ones of the Hokuyo, if not given.",
+        ),
+    ] = None,
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    *,
+    force: Annotated[bool, typer.Option("--force", help="Replace the model in --out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make published weights of S3-Net a model that predict takes."""
+    _check_free(out / "model.json", force=force)
+    from baselines.checkpoints import save_checkpoint
+    from baselines.published_weights import load_published
+    from semantic2d_dataset.access.torch_datasets import load_dataset
+    from semantic2d_dataset.scene.lidars import find_lidar
+
+    if data is None:
+        checkpoint = load_published(file, lidar=find_lidar(lidar), features=features)
+    else:
+        scans = load_dataset(data, lidar=lidar, split="train", scheme=scheme, features=features)
+        checkpoint = load_published(
+            file,
+            lidar=scans.lidar,
+            features=features,
+            statistics=scans.statistics,
+            taxonomy=scans.taxonomy,
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    save_checkpoint(out, checkpoint)
+    said: dict[str, object] = {
+        "model": str(out),
+        "lidar": checkpoint.lidar.name,
+        "features": checkpoint.features,
+    }
+    text = f"{out}: {file} for {checkpoint.lidar.name} with features {checkpoint.features}"
+    _report(said, text, as_json=as_json)
 
 
 def _check_free(path: Path, *, force: bool) -> None:
