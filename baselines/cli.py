@@ -109,7 +109,7 @@ def predict(
     force: Annotated[bool, typer.Option("--force", help="Replace the file --out.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Label the scans of a split by the majority of many samples."""
+    """Label the scans of a split; S3-Net by the majority of many samples."""
     _check_free(out, force=force)
     from baselines import inference
     from baselines.checkpoints import load_checkpoint
@@ -128,7 +128,8 @@ def predict(
         checkpoint, scans, out, samples=samples, seed=seed, with_probabilities=probabilities
     )
     said = {"predictions": str(out), "scans": count, "samples": samples}
-    _report(said, f"{out}: {count} scans labelled by {samples} samples each", as_json=as_json)
+    text = f"{out}: {count} scans labelled by {checkpoint.network.title}"
+    _report(said, text, as_json=as_json)
 
 
 @app.command(name="import")

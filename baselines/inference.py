@@ -116,7 +116,7 @@ def predict(
     *,
     samples: int = SAMPLES,
     seed: int = 0,
-    method: str = "S3-Net",
+    method: str | None = None,
     with_probabilities: bool = False,
 ) -> int:
     """Label every scan of a data set's split, and write a predictions file.
@@ -132,7 +132,7 @@ def predict(
     samples, seed
         As for `infer`.
     method
-        What the file calls the method.
+        What the file calls the method; the network's title where not given.
     with_probabilities
         Write class probabilities too (20 bytes a beam).
 
@@ -159,7 +159,7 @@ def predict(
             scheme=source.scheme,
             split=source.split or "all",
             taxonomy=checkpoint.taxonomy,
-            metadata=_metadata(checkpoint, method, seed),
+            metadata=_metadata(checkpoint, method or checkpoint.network.title, seed),
         ) as writer,
         tqdm(total=len(dataset), desc="predicting", unit="scan", disable=None) as bar,
     ):

@@ -16,7 +16,7 @@ from semantic2d_dataset.format.manifest import publish
 from semantic2d_dataset.format.sequence import SequenceHeader, SequenceWriter
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import Taxonomy
-from semantic2d_dataset.scoring.submission import score_predictions
+from semantic2d_dataset.scoring.submission import PredictionsReader, score_predictions
 from tests.baselines.test_cli import run
 from tests.generators import SMALL_LIDAR, make_arrays
 
@@ -78,6 +78,8 @@ def test_scans_of_four_classes_are_trained_on_and_scored(
     assert trained.taxonomy == FOUR
     assert trained.network.classes == 4
     scored = score(tmp_path / "run", four_classes, tmp_path / "p.h5")
+    with PredictionsReader(tmp_path / "p.h5") as reader:
+        assert reader.metadata["method"] == trained.network.title
     assert 0 <= scored["mIoU"] < 1
     assert "Tree" in json.dumps(scored)
 
