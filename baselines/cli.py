@@ -20,6 +20,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+DETECTORS = ("lines", "legs")  # of `detectors`, whose import is heavy
+
 Data = Annotated[str, typer.Option("--data", help="Name of a data set, or its folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print what was done as JSON.")]
 Device = Annotated[
@@ -91,16 +93,21 @@ def train(
 
 @app.command()
 def predict(
-    run: Annotated[Path, typer.Argument(help="Folder that training left.")],
+    run: Annotated[
+        str, typer.Argument(help="Folder that training left, or a geometric detector: lines, legs.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="Predictions file to write.")],
     data: Data = "semantic2d-mini",
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
     lidar: Annotated[
-        str | None, typer.Option(help="Whose scans to label; those of training, if not given.")
+        str | None,
+        typer.Option(help="Whose scans to label; if not given, that of training, or the hokuyo."),
     ] = None,
-    samples: Annotated[int, typer.Option(min=1, help="Latents drawn for each scan.")] = 32,
-    seed: Annotated[int, typer.Option(help="Of the latents.")] = 0,
+    samples: Annotated[
+        int | None, typer.Option(min=1, help="Latents drawn for each scan; 32, if not given.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the latents; 0, if not given.")] = None,
     device: Device = None,
     *,
     probabilities: Annotated[
@@ -109,13 +116,27 @@ def predict(
     force: Annotated[bool, typer.Option("--force", help="Replace the file --out.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Label the scans of a split; S3-Net by the majority of many samples."""
+    """Label the scans of a split: by a model, or by the geometry of lines or legs.
+
+    S3-Net decides by the majority of many samples. A folder that is called as a detector is, say ./lines.
+    """
     _check_free(out, force=force)
+    if run in DETECTORS:
+        given = {"--samples": samples, "--seed": seed, "--device": device}
+        refused = [name for name, value in given.items() if value is not None]
+        refused += ["--probabilities"] * probabilities
+        if refused:
+            raise typer.BadParameter(
+                f"{run} is a geometric detector: it has no {', '.join(refused)} "
+                f"(for a model in a folder of that name, say ./{run})"
+            )
+        _detect(run, out, data, lidar or "hokuyo", split, scheme, as_json=as_json)
+        return
     from baselines import inference
     from baselines.checkpoints import load_checkpoint
     from semantic2d_dataset.access.torch_datasets import load_dataset
 
-    checkpoint = load_checkpoint(run, device=_device(device))
+    checkpoint = load_checkpoint(Path(run), device=_device(device))
     scans = load_dataset(
         data,
         lidar=lidar or checkpoint.lidar.name,
@@ -124,8 +145,9 @@ def predict(
         features=checkpoint.features,
         statistics=checkpoint.statistics,
     )
+    samples = samples or inference.SAMPLES
     count = inference.predict(
-        checkpoint, scans, out, samples=samples, seed=seed, with_probabilities=probabilities
+        checkpoint, scans, out, samples=samples, seed=seed or 0, with_probabilities=probabilities
     )
     said = {"predictions": str(out), "scans": count, "samples": samples}
     text = f"{out}: {count} scans labelled by {checkpoint.network.title}"
@@ -178,6 +200,23 @@ def import_weights(
     }
     text = f"{out}: {file} for {checkpoint.lidar.name} with features {checkpoint.features}"
     _report(said, text, as_json=as_json)
+
+
+def _detect(
+    name: str, out: Path, data: str, lidar: str, split: str, scheme: str, *, as_json: bool
+) -> None:
+    """Label the scans of a split by one of `DETECTORS`."""
+    from baselines import detectors
+    from semantic2d_dataset.access.registry import open_dataset
+    from semantic2d_dataset.access.scan_source import ScanSource
+
+    detector = detectors.DETECTORS[name]
+    source = ScanSource(
+        open_dataset(data), lidar=lidar, split=split, scheme=scheme, in_memory=False
+    )
+    count = detectors.predict(detector, source, out)
+    said = {"predictions": str(out), "scans": count, "method": detector.method}
+    _report(said, f"{out}: {count} scans labelled by {detector.method}", as_json=as_json)
 
 
 def _check_free(path: Path, *, force: bool) -> None:
