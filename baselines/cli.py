@@ -113,18 +113,21 @@ def predict(
     probabilities: Annotated[
         bool, typer.Option("--probabilities", help="Write class probabilities too.")
     ] = False,
+    all_samples: Annotated[
+        bool, typer.Option("--all-samples", help="Write the labels of every sample too.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the file --out.")] = False,
     as_json: Json = False,
 ) -> None:
     """Label the scans of a split: by a model, or by the geometry of lines or legs.
 
-    S3-Net decides by the majority of many samples. A folder that is called as a detector is, say ./lines.
+    S3-Net decides by the majority of many samples. A folder named as a detector is, say, ./lines.
     """
     _check_free(out, force=force)
     if run in DETECTORS:
         given = {"--samples": samples, "--seed": seed, "--device": device}
         refused = [name for name, value in given.items() if value is not None]
-        refused += ["--probabilities"] * probabilities
+        refused += ["--probabilities"] * probabilities + ["--all-samples"] * all_samples
         if refused:
             raise typer.BadParameter(
                 f"{run} is a geometric detector: it has no {', '.join(refused)} "
@@ -147,7 +150,13 @@ def predict(
     )
     samples = samples or inference.SAMPLES
     count = inference.predict(
-        checkpoint, scans, out, samples=samples, seed=seed or 0, with_probabilities=probabilities
+        checkpoint,
+        scans,
+        out,
+        samples=samples,
+        seed=seed or 0,
+        with_probabilities=probabilities,
+        with_samples=all_samples,
     )
     said = {"predictions": str(out), "scans": count, "samples": samples}
     text = f"{out}: {count} scans labelled by {checkpoint.network.title}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -18,7 +18,7 @@ from baselines.checkpoints import Checkpoint
 from baselines.networks import Latent, SegmentationNetwork
 from baselines.s3net import S3Net
 from baselines.steps import keep_freed_memory
-from semantic2d_dataset.access.torch_datasets import LidarDataset
+from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scoring.submission import PredictionsWriter
 
@@ -28,6 +28,8 @@ SAMPLES = 32
 _DECODED_AT_ONCE = 32  # latents whose hidden layers fit a CPU's cache
 _ENCODED_AT_ONCE = 32
 _WRITTEN_AT_ONCE = 256
+
+_Sampled = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,9 @@ class SampledLabels:
         (N, B, K) f4: softmax, mean over the samples.
     entropy
         (N, B) f4, nats: of those probabilities.
+    mutual_information
+        (N, B) f4, nats: that entropy less the mean entropy of the samples, which is how much they
+        disagree; 0 for a network without a latent.
     samples
         (S, N, B) u1: the class that each sample chose.
     """
@@ -49,6 +54,7 @@ class SampledLabels:
     labels: NDArray[np.uint8]
     probabilities: NDArray[np.float32]
     entropy: NDArray[np.float32]
+    mutual_information: NDArray[np.float32]
     samples: NDArray[np.uint8]
 
 
@@ -77,36 +83,74 @@ def infer(
         raise InvalidInputError(f"samples: expected at least 1, found {samples}")
     with torch.inference_mode():
         if isinstance(network, S3Net):
-            chosen, votes, probabilities = _sample(network, features, samples, seed)
+            chosen, votes, probabilities, own = _sample(network, features, samples, seed)
         else:
-            chosen, votes, probabilities = _label_once(network, features)
-        entropy = torch.special.entr(probabilities).sum(2)
+            chosen, votes, probabilities, own = _label_once(network, features)
+        entropy = _entropy(probabilities, 2)
+        information = (entropy - own).clamp_(min=0.0)  # it is, but for rounding
     return SampledLabels(
         votes.argmax(2).to(torch.uint8).numpy(force=True),
         probabilities.numpy(force=True),
         entropy.numpy(force=True),
+        information.numpy(force=True),
         chosen.numpy(force=True),
     )
 
 
-def _label_once(network: SegmentationNetwork, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _label_once(network: SegmentationNetwork, features: Tensor) -> _Sampled:
     """Return as `_sample` what a network without a latent gives: one sample of each scan."""
     logits = [network.expected_logits(part) for part in torch.split(features, _ENCODED_AT_ONCE)]
     probabilities = torch.cat(logits).softmax(1).transpose(1, 2)
-    return probabilities.argmax(2).to(torch.uint8)[None], probabilities, probabilities
+    labels = probabilities.argmax(2).to(torch.uint8)
+    return labels[None], probabilities, probabilities, _entropy(probabilities, 2)
 
 
-def _sample(
-    network: S3Net, features: Tensor, samples: int, seed: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return labels (S, N, B) u1 of every sample, votes (N, B, K), mean probabilities (N, B, K)."""
+def _sample(network: S3Net, features: Tensor, samples: int, seed: int) -> _Sampled:
+    """Return what S samples give.
+
+    Returns
+    -------
+    labels (S, N, B) u1 of every sample, votes (N, B, K) i4, mean probabilities (N, B, K) f4, mean
+    entropies of the samples (N, B) f4
+    """
     noise = torch.Generator().manual_seed(seed)
     laws = [network.encode(part) for part in torch.split(features, _ENCODED_AT_ONCE)]
     law = Latent(*(torch.cat(parts) for parts in zip(*laws, strict=True)))
     latents = _draw(law, samples, noise)  # (N, S, 1, L)
     per_scan = [_decode_scan(network, drawn, features.shape[-1]) for drawn in latents]
-    chosen, votes, probabilities = (torch.stack(p) for p in zip(*per_scan, strict=True))
-    return chosen.transpose(0, 1), votes, probabilities
+    chosen, votes, probabilities, own = (torch.stack(p) for p in zip(*per_scan, strict=True))
+    return chosen.transpose(0, 1), votes, probabilities, own
+
+
+def infer_scans(
+    checkpoint: Checkpoint, dataset: LidarDataset, *, samples: int = SAMPLES, seed: int = 0
+) -> Iterator[tuple[Batch, SampledLabels]]:
+    """Label every scan of a data set's split, one batch after the other.
+
+    Parameters
+    ----------
+    checkpoint, dataset, samples, seed
+        As for `predict`.
+
+    Yields
+    ------
+    batch
+        As the loader of the data set gives it.
+    found
+        What the samples say of its scans.
+
+    Raises
+    ------
+    InvalidInputError
+        If the data set does not fit the model.
+    """
+    _check_dataset(checkpoint, dataset)
+    keep_freed_memory()
+    device = next(checkpoint.network.parameters()).device
+    for i, batch in enumerate(dataset.loader(_WRITTEN_AT_ONCE)):
+        own_seed = int(np.random.SeedSequence((seed, i)).generate_state(1)[0])
+        features = batch["features"].to(device)
+        yield batch, infer(checkpoint.network, features, samples=samples, seed=own_seed)
 
 
 def predict(
@@ -118,6 +162,7 @@ def predict(
     seed: int = 0,
     method: str | None = None,
     with_probabilities: bool = False,
+    with_samples: bool = False,
 ) -> int:
     """Label every scan of a data set's split, and write a predictions file.
 
@@ -135,6 +180,8 @@ def predict(
         What the file calls the method; the network's title where not given.
     with_probabilities
         Write class probabilities too (20 bytes a beam).
+    with_samples
+        Write the label of every sample too (S bytes a beam, which stay in memory until the end).
 
     Returns
     -------
@@ -149,7 +196,6 @@ def predict(
         If the file cannot be written.
     """
     _check_dataset(checkpoint, dataset)
-    keep_freed_memory()
     source = dataset.source
     with (
         PredictionsWriter(
@@ -163,13 +209,15 @@ def predict(
         ) as writer,
         tqdm(total=len(dataset), desc="predicting", unit="scan", disable=None) as bar,
     ):
-        for i, batch in enumerate(dataset.loader(_WRITTEN_AT_ONCE)):
-            own_seed = int(np.random.SeedSequence((seed, i)).generate_state(1)[0])
-            device = next(checkpoint.network.parameters()).device
-            features = batch["features"].to(device)
-            found = infer(checkpoint.network, features, samples=samples, seed=own_seed)
-            _write(writer, batch["scan_id"], found, with_probabilities=with_probabilities)
-            bar.update(len(features))
+        for batch, found in infer_scans(checkpoint, dataset, samples=samples, seed=seed):
+            _write(
+                writer,
+                batch["scan_id"],
+                found,
+                with_probabilities=with_probabilities,
+                with_samples=with_samples,
+            )
+            bar.update(len(found.labels))
     return len(dataset)
 
 
@@ -179,6 +227,7 @@ def _write(
     found: SampledLabels,
     *,
     with_probabilities: bool,
+    with_samples: bool,
 ) -> None:
     """Write a batch, one call for each run of scans of a sequence."""
     start = 0
@@ -187,7 +236,8 @@ def _write(
         scan_index = np.array([int(index) for _, _, index in run], np.int64)
         rows = slice(start, start + len(scan_index))
         probabilities = found.probabilities[rows].astype(np.float16) if with_probabilities else None
-        writer.add(sequence_id, scan_index, found.labels[rows], probabilities)
+        samples = found.samples[:, rows] if with_samples else None
+        writer.add(sequence_id, scan_index, found.labels[rows], probabilities, samples)
         start = rows.stop
 
 
@@ -225,16 +275,26 @@ def _draw(law: Latent, samples: int, noise: torch.Generator) -> Tensor:
     return law.mean[:, None] + law.log_sd.exp()[:, None] * drawn
 
 
-def _decode_scan(network: S3Net, latents: Tensor, beams: int) -> tuple[Tensor, Tensor, Tensor]:
+def _entropy(probabilities: Tensor, dim: int) -> Tensor:
+    """Entropy along a dimension, nats."""
+    entropy: Tensor = torch.special.entr(probabilities).sum(dim)
+    return entropy
+
+
+def _decode_scan(network: S3Net, latents: Tensor, beams: int) -> _Sampled:
     """Decode latents (S, 1, L) of one scan.
 
     Returns
     -------
-    labels (S, B) u1 of every sample, votes (B, K) i4, mean probabilities (B, K) f4
+    labels (S, B) u1 of every sample, votes (B, K) i4, mean probabilities (B, K) f4, mean
+    entropy of the samples (B,) f4
     """
     parts = torch.split(latents, _DECODED_AT_ONCE)
     logits = torch.cat([network.decode(part, beams) for part in parts])
     labels = logits.max(1).indices  # (S, B); argmax takes 5 times longer
     votes = torch.zeros((network.classes, beams), dtype=torch.int32, device=labels.device)
     votes.scatter_add_(0, labels, torch.ones_like(labels, dtype=torch.int32))
-    return labels.to(torch.uint8), votes.t(), logits.softmax(1).mean(0).t()
+    logs = logits.log_softmax(1)  # (S, K, B); with their exponentials faster than entr
+    probabilities = logs.exp()
+    own = logs.mul_(probabilities).sum((0, 1)) / -len(logs)
+    return labels.to(torch.uint8), votes.t(), probabilities.mean(0).t(), own

@@ -10,7 +10,7 @@ from scipy import stats
 
 from baselines.checkpoints import Checkpoint
 from baselines.inference import infer, predict
-from baselines.networks import Latent
+from baselines.networks import Latent, Prediction, SegmentationNetwork
 from baselines.s3net import S3Net
 from semantic2d_dataset import load_dataset, open_dataset
 from semantic2d_dataset.access.torch_datasets import LidarDataset
@@ -59,6 +59,37 @@ def test_encoding_once_gives_what_the_whole_network_gives_sample_by_sample(netwo
     np.testing.assert_allclose(found.probabilities, mean, atol=1e-5)
     entropy = -(mean * np.log(mean)).sum(-1)
     np.testing.assert_allclose(found.entropy, entropy, atol=1e-4)
+    own = -(np.array(probabilities) * np.log(probabilities)).sum(2).mean(0)
+    np.testing.assert_allclose(found.mutual_information, entropy - own, atol=1e-4)
+    assert (found.mutual_information >= 0).all()
+    assert found.mutual_information.max() > 0.01
+
+
+def test_one_sample_disagrees_with_nobody(network, features):
+    assert infer(network, features, samples=1).mutual_information.max() < 1e-5
+
+
+class NoLatent(SegmentationNetwork):
+    """A network without a latent: one linear map for every beam."""
+
+    name, title, least_beams = "none", "None", 1
+
+    def __init__(self):
+        super().__init__(3, 10)
+        self.map = torch.nn.Conv1d(3, 10, 1)
+
+    def forward(self, features):
+        return Prediction(self.map(features))
+
+    def expected_logits(self, features):
+        return self.map(features)
+
+
+def test_a_network_without_a_latent_has_no_mutual_information(features):
+    found = infer(NoLatent().eval(), features, samples=4)
+    assert found.samples.shape == (1, 5, 61)
+    assert found.entropy.min() > 0
+    assert (found.mutual_information == 0).all()
 
 
 def test_scans_split_into_chunks_give_what_they_give_together(network, monkeypatch):
@@ -96,7 +127,7 @@ def test_predictions_of_a_split_are_valid_and_complete(
     checkpoint, scans, dataset_folder: Path, tmp_path: Path
 ):
     path = tmp_path / "predictions.h5"
-    count = predict(checkpoint, scans, path, samples=3, with_probabilities=True)
+    count = predict(checkpoint, scans, path, samples=3, with_probabilities=True, with_samples=True)
     assert count == len(scans)
     assert validate(path, open_dataset(dataset_folder)) == []
     with PredictionsReader(path) as reader:
@@ -105,6 +136,9 @@ def test_predictions_of_a_split_are_valid_and_complete(
         name = reader.sequence_ids[0]
         probabilities = reader.read(name, "probabilities").astype(np.float32)
         assert len(reader.read(name, "labels")) == len(probabilities)
+        samples = reader.read(name, "samples")
+        assert np.array_equal(stats.mode(samples, axis=0).mode, reader.read(name, "labels"))
+        assert len(samples) == 3
     np.testing.assert_allclose(probabilities.sum(-1), 1, atol=0.01)
 
 
