@@ -161,6 +161,39 @@ def plot_class_bars(result: Mapping[str, Any]) -> Figure:
     return figure
 
 
+def plot_reliability(calibration: Mapping[str, Any]) -> Figure:
+    """Draw accuracy against confidence, and the share of errors against entropy.
+
+    Below each are the points of its bins. Confidence that can be trusted has its bars end on the
+    diagonal; entropy that tells errors has bars that rise.
+
+    Parameters
+    ----------
+    calibration
+        As `Calibration.compute` returns it.
+    """
+    figure = _empty_figure(11.0, 5.6)
+    axes = figure.subplots(2, 2, sharex="col", height_ratios=(3, 1))
+    reliability, errors = axes.T
+    _draw_bins(reliability, calibration["confidence_bins"], "accuracy")
+    reliability[0].plot((0, 1), (0, 100), color=_EDGE, linestyle="--", linewidth=1, zorder=3)
+    reliability[0].set_title(
+        f"Expected calibration error {percent(calibration['ece'])} %, largest "
+        f"{percent(calibration['mce'])} %",
+        fontsize=10,
+    )
+    reliability[0].set_ylabel("Accuracy (%)")
+    reliability[1].set_xlabel("Confidence of the label")
+    reliability[1].set_ylabel("Points (%)")
+    _draw_bins(errors, calibration["entropy_bins"], "error")
+    errors[0].set_title(
+        f"Area under risk and coverage {percent(calibration['aurc'])} %", fontsize=10
+    )
+    errors[0].set_ylabel("Wrong points (%)")
+    errors[1].set_xlabel("Entropy (nats)")
+    return figure
+
+
 def plot_map(
     scene: SemanticMap, *, ax: Axes | None = None, taxonomy: Taxonomy = SEMANTIC2D
 ) -> Figure:
@@ -282,6 +315,20 @@ def _labels_of(scan: Scan, labels: NDArray[np.uint8] | None) -> NDArray[np.uint8
     if scan.labels is None:
         return np.full(scan.lidar.beams, UNLABELLED, np.uint8)
     return scan.labels
+
+
+def _draw_bins(axes: Sequence[Axes], bins: Sequence[Mapping[str, Any]], figure: str) -> None:
+    """Draw a figure of bins in percent, and below it the share of points that each holds."""
+    low = [row["low"] for row in bins]
+    widths = [row["high"] - row["low"] for row in bins]
+    total = max(sum(row["points"] for row in bins), 1)
+    heights = [100 * (row[figure] or 0.0) for row in bins]
+    shares = [100 * row["points"] / total for row in bins]
+    for ax, values, colour in zip(axes, (heights, shares), (_IOU, _CA), strict=True):
+        ax.bar(low, values, widths, align="edge", color=colour, edgecolor="white", linewidth=0.8)
+        ax.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylim(0, 100)
+    axes[0].set_xlim(0, bins[-1]["high"])
 
 
 def _draw_points(

@@ -9,6 +9,7 @@ from semantic2d_dataset.plotting import (
     plot_labelled_scan_on_map,
     plot_map,
     plot_prediction_beside_truth,
+    plot_reliability,
     plot_scan,
     save,
 )
@@ -17,6 +18,7 @@ from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW as HOKUYO
 from semantic2d_dataset.scene.maps import FREE, OCCUPIED, UNKNOWN, SemanticMap
 from semantic2d_dataset.scene.scans import Scan
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
+from semantic2d_dataset.scoring.calibration import Calibration
 from semantic2d_dataset.scoring.metrics import Evaluator
 
 # (x, y, width, height) in m and class, in a room of 12 by 8 m
@@ -185,7 +187,23 @@ def test_bars_have_the_heights_of_the_scores_and_say_where_there_is_none():
     assert result["Trash bin"]["ca"] is None
 
 
+def test_reliability_has_the_heights_of_the_bins_and_the_share_of_points_below():
+    rng = np.random.default_rng(0)
+    probabilities = rng.dirichlet(np.full(10, 0.2), (1, 5000)).astype(np.float32)
+    result = Calibration().update(rng.integers(0, 10, (1, 5000)), probabilities).compute()
+    (accuracy, error), (below, _) = np.reshape(plot_reliability(result).axes, (2, 2))
+    for ax, rows, figure in (
+        (accuracy, result["confidence_bins"], "accuracy"),
+        (error, result["entropy_bins"], "error"),
+    ):
+        heights = [bar.get_height() for bar in ax.patches]
+        assert heights == pytest.approx([100 * (row[figure] or 0) for row in rows])
+    assert sum(bar.get_height() for bar in below.patches) == pytest.approx(100)
+    assert accuracy.lines[0].get_xydata().tolist() == [[0, 0], [1, 100]]
+
+
 def test_pictures_of_an_empty_result_can_be_drawn(tmp_path):
+    save(plot_reliability(Calibration().compute()), tmp_path / "reliability.png")
     for n, plot in enumerate((plot_confusion, plot_class_bars)):
         save(plot(Evaluator().compute()), tmp_path / f"{n}.png")
 
