@@ -43,6 +43,9 @@ def train(
     seed: Annotated[int | None, typer.Option(help="Of weights, order and latents.")] = None,
     device: Device = None,
     *,
+    augment: Annotated[
+        bool, typer.Option("--augment", help="Change training scans at random.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where --out stopped.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the model in --out.")] = False,
     as_json: Json = False,
@@ -51,6 +54,7 @@ def train(
     from baselines import training
     from baselines.architectures import check_model
     from semantic2d_dataset.access.torch_datasets import load_dataset
+    from semantic2d_dataset.access.transforms import default_augmentation
 
     check_model(model)
     _check_free(out / "model.json", force=force or resume)
@@ -61,11 +65,15 @@ def train(
         epochs=epochs,
         time_limit_s=None if minutes is None else 60 * minutes,
         seed=seed,
+        augment=augment or None,
     )
     train_part, val_part = (
         load_dataset(data, lidar=lidar, split=split, scheme=scheme, features=config.features)
         for split in ("train", "val")
     )
+    if config.augment:
+        train_part.transform = default_augmentation(train_part.lidar)
+        train_part.transform_seed = config.seed
     manifest = train_part.source.data.manifest
     result = training.train(
         config,

@@ -43,6 +43,9 @@ class TrainingConfig:
         Of weights, order of scans and latents.
     bf16
         Let convolutions compute with 16 bits.
+    augment
+        Whether the scans of the training split are changed at random: see
+        `transforms.default_augmentation`. (The published training is not known to do so.)
     time_limit_s
         Stop after so many seconds; `schedule` then ends there too.
     """
@@ -59,6 +62,7 @@ class TrainingConfig:
     class_weight_power: float = 1.0
     seed: int = 0
     bf16: bool = False
+    augment: bool = False
     time_limit_s: float | None = None
 
     def __post_init__(self) -> None:

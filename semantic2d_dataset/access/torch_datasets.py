@@ -23,6 +23,7 @@ from semantic2d_dataset.access.features import (
 from semantic2d_dataset.access.registry import OpenDataset, open_dataset
 from semantic2d_dataset.access.scan_source import Fields, ScanSource
 from semantic2d_dataset.access.torch_samplers import BlockShuffleSampler
+from semantic2d_dataset.access.transforms import Transform
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.geometry import incidence_angles
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW, RPLIDAR_S2, WLR_716, LidarSpec
@@ -78,6 +79,13 @@ class LidarDataset(Dataset[Batch]):
         Standardises features; those of the train split where not given.
     in_memory
         Keep the split in memory; where not given, when it fits in half of what is free.
+    transform
+        Changes scans before their features are computed, such as
+        `transforms.default_augmentation`; statistics and `class_counts` stay those of the scans
+        as they were measured.
+    transform_seed
+        Its randomness comes from this seed and the indices of the batch, in their order: it is
+        the same with any number of workers, and differs between epochs that are shuffled.
 
     Raises
     ------
@@ -99,11 +107,14 @@ class LidarDataset(Dataset[Batch]):
         features: str | None = None,
         statistics: Statistics | None = None,
         in_memory: bool | None = None,
+        transform: Transform | None = None,
+        transform_seed: int = 0,
     ) -> None:
         name = lidar or (self.spec.name if self.spec else None)
         if name is None:
             raise InvalidInputError("say which lidar, such as lidar='hokuyo'")
         self.features = None if features is None else normalise_features(features)
+        self.transform, self.transform_seed = transform, transform_seed
         self._buffers = Buffers()
         self.source = ScanSource(data, lidar=name, split=split, scheme=scheme, in_memory=in_memory)
         if "I" in (self.features or "") and not self.source.has_intensities:
@@ -137,6 +148,10 @@ class LidarDataset(Dataset[Batch]):
         if wanted.size and not (wanted.min() >= 0 and wanted.max() < len(self)):
             raise IndexError(f"expected indices below {len(self)}, found {list(indices)}")
         fields, rows = self.source.fetch(wanted)
+        if self.transform is not None:
+            fields = {name: values[rows] for name, values in fields.items()}
+            rng = np.random.default_rng((self.transform_seed, *wanted.tolist()))
+            fields, rows = self.transform(fields, self.lidar, rng), np.arange(len(wanted))
         ids = self.source.scan_ids[wanted].tolist()
         return BatchView(self._tensors(fields, rows) | {"scan_id": ids})
 

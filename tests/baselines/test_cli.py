@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from baselines.checkpoints import load_checkpoint
 from baselines.cli import app
 from semantic2d_dataset import open_dataset
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError, Semantic2DError
@@ -39,6 +40,18 @@ def test_a_trained_model_predicts_what_can_be_scored(
     scored = score_predictions(out, data)
     assert json.loads(said)["scans"] == scored["submission"]["scans"]
     assert 0 <= scored["mIoU"] < 1
+
+
+def test_a_training_with_augmentation_says_so_and_keeps_the_statistics(
+    model: Path, dataset_folder: Path, tmp_path: Path
+):
+    out = tmp_path / "augmented"
+    usual = ("--data", dataset_folder, "--lidar", "small", "--preset", "quick", "--epochs", 1)
+    run("train", "s3net", *usual, "--augment", "--out", out)
+    plain, augmented = (load_checkpoint(folder) for folder in (model, out))
+    assert (plain.training["augment"], augmented.training["augment"]) == (False, True)
+    assert plain.statistics == augmented.statistics
+    assert (out / "log.csv").read_text() != (model / "log.csv").read_text()
 
 
 @pytest.mark.parametrize(
