@@ -1,4 +1,4 @@
-"""The commands ``semantic2d baseline train``, ``predict`` and ``import``."""
+"""The commands ``semantic2d baseline``: train models, predict with them, evaluate them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import typer
 from semantic2d_dataset.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from baselines.checkpoints import Checkpoint
     from baselines.configs import TrainingConfig
+    from semantic2d_dataset.access.torch_datasets import LidarDataset
 
 app = typer.Typer(
     help="Train models on labelled scans, and predict with them.",
@@ -145,17 +147,9 @@ def predict(
         return
     from baselines import inference
     from baselines.checkpoints import load_checkpoint
-    from semantic2d_dataset.access.torch_datasets import load_dataset
 
     checkpoint = load_checkpoint(Path(run), device=_device(device))
-    scans = load_dataset(
-        data,
-        lidar=lidar or checkpoint.lidar.name,
-        split=split,
-        scheme=scheme,
-        features=checkpoint.features,
-        statistics=checkpoint.statistics,
-    )
+    scans = _scans_for(checkpoint, data, lidar, split, scheme)
     samples = samples or inference.SAMPLES
     count = inference.predict(
         checkpoint,
@@ -234,6 +228,52 @@ def _detect(
     count = detectors.predict(detector, source, out)
     said = {"predictions": str(out), "scans": count, "method": detector.method}
     _report(said, f"{out}: {count} scans labelled by {detector.method}", as_json=as_json)
+
+
+@app.command()
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Folder that training left.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for evaluation.json and pictures.")],
+    data: Data = "semantic2d-mini",
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    lidar: Annotated[
+        str | None, typer.Option(help="Whose scans to score; those of training, if not given.")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="Latents drawn for each scan.")] = 32,
+    seed: Annotated[int, typer.Option(help="Of the latents.")] = 0,
+    device: Device = None,
+    *,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Score a model on a split: mean and spread over samples, calibration, and speed."""
+    _check_free(out / "evaluation.json", force=force)
+    from baselines import evaluation
+    from baselines.checkpoints import load_checkpoint
+
+    checkpoint = load_checkpoint(run, device=_device(device))
+    scans = _scans_for(checkpoint, data, lidar, split, scheme)
+    found = evaluation.evaluate(checkpoint, scans, samples=samples, seed=seed)
+    out.mkdir(parents=True, exist_ok=True)
+    evaluation.write_evaluation(found, out)
+    typer.echo(found.to_json() if as_json else evaluation.format_evaluation(found), nl=not as_json)
+
+
+def _scans_for(
+    checkpoint: Checkpoint, data: str, lidar: str | None, split: str, scheme: str
+) -> LidarDataset:
+    """Load the scans of a split as a model wants them."""
+    from semantic2d_dataset.access.torch_datasets import load_dataset
+
+    return load_dataset(
+        data,
+        lidar=lidar or checkpoint.lidar.name,
+        split=split,
+        scheme=scheme,
+        features=checkpoint.features,
+        statistics=checkpoint.statistics,
+    )
 
 
 def _check_free(path: Path, *, force: bool) -> None:

@@ -7,6 +7,7 @@ class colours (Person, Table) are close to white paper.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +24,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike, NDArray
 
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.format.writing import write_bytes_atomically
 from semantic2d_dataset.scene.geometry import Pose2, to_base, to_points
 from semantic2d_dataset.scene.maps import FREE, OCCUPIED, SemanticMap
 from semantic2d_dataset.scene.scans import Scan, check_array
@@ -280,15 +282,18 @@ def check_picture_name(path: Path) -> None:
 
 
 def save(figure: Figure, path: Path, *, dpi: int = 150) -> None:
-    """Write a figure; the ending of the name chooses the format.
+    """Write a figure in one step; the ending of the name chooses the format.
 
     Raises
     ------
     InvalidInputError
         As `check_picture_name` does.
     """
+    path = Path(path)
     check_picture_name(path)
-    figure.savefig(path, dpi=dpi)
+    content = io.BytesIO()
+    figure.savefig(content, dpi=dpi, format=path.suffix.removeprefix(".").lower())
+    write_bytes_atomically(path, content.getvalue())
 
 
 def _empty_figure(width: float, height: float) -> Figure:

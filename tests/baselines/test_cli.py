@@ -94,6 +94,20 @@ def test_predictions_that_are_there_are_not_replaced_unless_forced(
     assert "scans labelled" in run(*words, "--force")
 
 
+def test_a_model_is_evaluated_into_a_folder_that_is_not_replaced_unless_forced(
+    model: Path, dataset_folder: Path, tmp_path: Path
+):
+    out = tmp_path / "scores"
+    words = ("evaluate", model, "--data", dataset_folder, "--samples", 2, "--out", out)
+    said = run(*words)
+    assert "All classes" in said
+    assert "over 2 samples" in said
+    assert json.loads((out / "evaluation.json").read_text())["samples"] == 2
+    with pytest.raises(InvalidInputError, match="exists already"):
+        run(*words)
+    assert json.loads(run(*words, "--force", "--json"))["model"] == "S3-Net"
+
+
 def test_a_missing_model_is_one_clear_error(dataset_folder: Path, tmp_path: Path):
     with pytest.raises(DatasetNotFoundError, match="no trained model here"):
         run("predict", tmp_path, "--data", dataset_folder, "--out", tmp_path / "p.h5")
