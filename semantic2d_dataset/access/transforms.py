@@ -183,14 +183,16 @@ class BeamDropout:
 
 
 def default_augmentation(lidar: LidarSpec) -> Compose:
-    """Return the transforms that a lidar allows, with mild noise.
+    """Return the changes of view that a lidar allows: mirrored, and turned if it sees all around.
 
-    1 cm is the noise of the Hokuyo's ranges by its data sheet (repeated accuracy below 10 m);
-    5 % of intensity and 2 % of beams are guesses.
+    Noise is left out: on the Hokuyo scans of semantic2d-mini, 15 epochs of quick training, three
+    seeds, `Mirror` raised the validation mIoU by 0.1 to 2.4 points. With 1 cm of `RangeNoise`
+    beside it, it fell 3.6 below none (two seeds), presumably because incidence is computed from
+    ranges; 5 % of `IntensityNoise` or 2 % of `BeamDropout` beside it cost 0.8 and 0.7 (one seed).
     """
     allowed: list[Transform] = [Mirror()] if is_symmetric(lidar) else []
     allowed += [Roll()] if sees_all_around(lidar) else []
-    return Compose((*allowed, RangeNoise(0.01), IntensityNoise(0.05), BeamDropout(0.02)))
+    return Compose(tuple(allowed))
 
 
 def is_symmetric(lidar: LidarSpec) -> bool:
