@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,16 @@ import torch
 from torch import Tensor
 
 from baselines.architectures import build_network, check_model
+from baselines.descriptions import Description, check_format
 from baselines.networks import SegmentationNetwork
 from semantic2d_dataset.access.features import Statistics, channel_count
 from semantic2d_dataset.errors import (
     CorruptFileError,
     DatasetNotFoundError,
-    FormatVersionError,
     InvalidInputError,
     WriteError,
 )
-from semantic2d_dataset.format.schema import FORMAT_MAJOR, FORMAT_VERSION
+from semantic2d_dataset.format.schema import FORMAT_VERSION
 from semantic2d_dataset.format.writing import partial_name, write_text_atomically
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import Taxonomy
@@ -69,6 +69,12 @@ class Checkpoint:
     dataset: Mapping[str, str] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def description(self) -> Description:
+        """All but the network."""
+        parts = (self.features, self.statistics, self.lidar, self.taxonomy)
+        return Description(*parts, self.dataset, self.training)
+
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint into a folder, replacing the one that is there.
@@ -80,14 +86,7 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """
     network = checkpoint.network
     architecture = {"name": network.name, "channels": network.channels, "classes": network.classes}
-    parts = ("statistics", "lidar", "taxonomy")
-    said = {
-        "architecture": architecture,
-        "features": checkpoint.features,
-        **{part: asdict(getattr(checkpoint, part)) for part in parts},
-        "dataset": dict(checkpoint.dataset),
-        "training": dict(checkpoint.training),
-    }
+    said = {"architecture": architecture} | checkpoint.description.as_json()
     write_state(folder, _MODEL, said, network.state_dict())
 
 
@@ -182,18 +181,7 @@ def _read_json(path: Path) -> dict[str, Any]:
         said = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as err:
         raise CorruptFileError(f"{path}: not a JSON file: {err}") from err
-    if not isinstance(said, dict) or said.get("format") != _KIND:
-        raise CorruptFileError(f"{path}: expected a JSON object with format {_KIND!r}")
-    version = str(said.get("format_version", ""))
-    major = version.split(".", maxsplit=1)[0]
-    if not major.isdigit():
-        raise CorruptFileError(f"{path}: expected a format version, found {version!r}")
-    if int(major) > FORMAT_MAJOR:
-        raise FormatVersionError(
-            f"{path}: written in format {version}, and this package reads up to "
-            f"{FORMAT_MAJOR}.x; install semantic2d-dataset {major}.0 or later"
-        )
-    return said
+    return check_format(path, said, _KIND)
 
 
 def _read_tensors(path: Path, size: int, digest: str) -> dict[str, Tensor]:
@@ -213,24 +201,21 @@ def _read_tensors(path: Path, size: int, digest: str) -> dict[str, Tensor]:
 
 def _understand(said: Mapping[str, Any]) -> Checkpoint:
     """Build what a JSON file describes; the network has no weights yet."""
-    architecture, features = said["architecture"], said["features"]
-    check_model(architecture["name"])
-    if channel_count(features) != architecture["channels"]:
-        raise InvalidInputError(f"features {features} are not {architecture['channels']} channels")
-    taxonomy = said["taxonomy"]
-    names, colours = taxonomy["names"], tuple(tuple(colour) for colour in taxonomy["colours"])
-    if len(names) != architecture["classes"]:
-        raise InvalidInputError(f"{len(names)} names for {architecture['classes']} classes")
-    statistics = {key: tuple(values) for key, values in said["statistics"].items()}
-    lidar = LidarSpec(**said["lidar"] | {"base_T_lidar": tuple(said["lidar"]["base_T_lidar"])})
+    check_model(said["architecture"]["name"])
+    name, channels, classes = (said["architecture"][key] for key in ("name", "channels", "classes"))
+    about = Description.from_json(said)
+    if channel_count(about.features) != channels:
+        raise InvalidInputError(f"features {about.features} are not {channels} channels")
+    if len(about.taxonomy) != classes:
+        raise InvalidInputError(f"{len(about.taxonomy)} names for {classes} classes")
     return Checkpoint(
-        build_network(architecture["name"], architecture["channels"], len(names), lidar),
-        features,
-        Statistics(**statistics),
-        lidar,
-        Taxonomy(tuple(names), colours, taxonomy["background_id"]),
-        dict(said["dataset"]),
-        dict(said["training"]),
+        build_network(name, channels, classes, about.lidar),
+        about.features,
+        about.statistics,
+        about.lidar,
+        about.taxonomy,
+        about.dataset,
+        about.training,
     )
 
 

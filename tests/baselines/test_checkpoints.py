@@ -117,6 +117,9 @@ def test_a_file_that_is_not_a_checkpoint_is_refused(folder: Path, text: str):
         load_checkpoint(folder)
 
 
+TWO_CLASSES = {"names": ["a", "b"], "colours": [[0, 0, 0]] * 2, "background_id": 0}
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -124,11 +127,11 @@ def test_a_file_that_is_not_a_checkpoint_is_refused(folder: Path, text: str):
         ({"weights": None}, "does not say which weights"),
         ({"architecture": {"name": "other"}}, "unknown model 'other'"),
         ({"architecture": {"name": "s3net", "channels": 3}}, "classes"),
-        ({"features": "RI"}, "are not 3 channels"),
+        ({"features": "RI"}, "RI are 2 channels, and the statistics 3"),
         ({"features": 5}, "not the description"),
         ({"statistics": {"mean": [0, 0], "std": [1]}}, "one mean and one std"),
         ({"lidar": {"name": "x"}}, "base_T_lidar"),
-        ({"taxonomy": {"names": ["a", "b"], "colours": []}}, "2 names for 10 classes"),
+        ({"taxonomy": TWO_CLASSES}, "2 names for 10 classes"),
         ({"training": None}, "not the description"),
     ],
 )
