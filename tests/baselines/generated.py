@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
+from baselines.s3net import S3Net
 from semantic2d_dataset.access.features import Statistics
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
@@ -24,6 +26,24 @@ def make_scans(scans: int, beams: int, seed: int = 0) -> tuple[torch.Tensor, tor
         torch.from_numpy(features.transpose(1, 0, 2).astype(np.float32)),
         torch.from_numpy(labels),
     )
+
+
+def stir_batch_norms(network: nn.Module) -> nn.Module:
+    """Give batch norms statistics and weights that none survives who forgets one of them."""
+    torch.manual_seed(3)
+    with torch.no_grad():
+        for layer in network.modules():
+            if isinstance(layer, nn.modules.batchnorm._BatchNorm):
+                for tensor in (*layer.parameters(), *layer.buffers()):
+                    if tensor.is_floating_point():
+                        tensor.uniform_(0.5, 1.5)
+    return network
+
+
+def make_network(channels: int = 3) -> S3Net:
+    """An S3-Net in evaluation mode whose batch norms do something."""
+    torch.manual_seed(3)
+    return stir_batch_norms(S3Net(channels)).eval()
 
 
 class ToyScans:
