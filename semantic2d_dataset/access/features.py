@@ -138,7 +138,7 @@ def features_of(
     inputs = (
         np.ascontiguousarray(ranges),
         np.ascontiguousarray(ranges if intensities is None else intensities),
-        np.ascontiguousarray(beam_directions(lidar.bearings).T, np.float32),
+        _directions_of(lidar),
         codes,
         np.array((chosen.mean, 1.0 / np.array(chosen.std)), np.float32),
         _limits_of(lidar),
@@ -201,6 +201,12 @@ def _share(work: Callable[[slice], None], count: int) -> None:
 @functools.cache
 def _threads(pid: int) -> ThreadPoolExecutor:  # noqa: ARG001 - a fork gets threads of its own
     return ThreadPoolExecutor(2)
+
+
+@functools.lru_cache(maxsize=64)
+def _directions_of(lidar: LidarSpec) -> NDArray[np.float32]:
+    """Return cosines and sines of all beams (2, B); they take as long as a scan's features."""
+    return np.ascontiguousarray(beam_directions(lidar.bearings).T, np.float32)
 
 
 def _limits_of(lidar: LidarSpec) -> _Limits:
