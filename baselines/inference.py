@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
 from baselines.checkpoints import Checkpoint
 from baselines.networks import Latent, SegmentationNetwork
 from baselines.s3net import S3Net
+from baselines.sampled_labels import SampledLabels
 from baselines.steps import keep_freed_memory
 from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
 from semantic2d_dataset.errors import InvalidInputError
@@ -30,32 +29,6 @@ _ENCODED_AT_ONCE = 32
 _WRITTEN_AT_ONCE = 256
 
 _Sampled = tuple[Tensor, Tensor, Tensor, Tensor]
-
-
-@dataclass(frozen=True)
-class SampledLabels:
-    """What S samples say of N scans.
-
-    Parameters
-    ----------
-    labels
-        (N, B) u1: the class that most samples chose; of equals, the lowest id.
-    probabilities
-        (N, B, K) f4: softmax, mean over the samples.
-    entropy
-        (N, B) f4, nats: of those probabilities.
-    mutual_information
-        (N, B) f4, nats: that entropy less the mean entropy of the samples, which is how much they
-        disagree; 0 for a network without a latent.
-    samples
-        (S, N, B) u1: the class that each sample chose.
-    """
-
-    labels: NDArray[np.uint8]
-    probabilities: NDArray[np.float32]
-    entropy: NDArray[np.float32]
-    mutual_information: NDArray[np.float32]
-    samples: NDArray[np.uint8]
 
 
 def infer(

@@ -52,6 +52,11 @@ class S3Net(SegmentationNetwork):
         self.check_features(features)
         return Latent(*(head.squeeze(2) for head in self._encoder(_as_image(features))))
 
+    @staticmethod
+    def positions(beams: int) -> int:
+        """Return the number L of positions of the latent of scans of so many beams."""
+        return beams // 2 // 2
+
     def decode(self, latent: Tensor, beams: int) -> Tensor:
         """Return the logits (N, K, B) of latents (N, 1, L) with L = B // 2 // 2.
 
@@ -60,7 +65,7 @@ class S3Net(SegmentationNetwork):
         InvalidInputError
             If the latents do not belong to scans of so many beams.
         """
-        shape, positions = tuple(latent.shape), beams // 2 // 2
+        shape, positions = tuple(latent.shape), self.positions(beams)
         if len(shape) != 3 or shape[1:] != (1, positions):
             raise InvalidInputError(
                 f"latent of {beams} beams: expected (N, 1, {positions}), found {shape}"
