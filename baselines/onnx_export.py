@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import onnxruntime
+import onnxscript  # noqa: F401 - torch's exporter needs it, and says so less clearly
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn

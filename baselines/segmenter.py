@@ -110,6 +110,7 @@ class Segmenter:
             self._mask(scans, np.concatenate([one.labels for one in each])),
             np.concatenate([one.probabilities for one in each]),
             np.concatenate([one.entropy for one in each]),
+            np.concatenate([one.mutual_information for one in each]),
             np.concatenate([one.samples for one in each], axis=1),
         )
 

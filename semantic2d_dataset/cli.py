@@ -33,6 +33,14 @@ app = typer.Typer(
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 _INTERRUPTED = 130
+_EXTRAS = {
+    "torch": ("PyTorch", "torch"),
+    "safetensors": ("PyTorch", "torch"),
+    "onnx": ("ONNX", "onnx"),
+    "onnxscript": ("ONNX", "onnx"),
+    "onnxruntime": ("ONNX Runtime", "onnx"),
+}
+"""What a command may need beside what is always installed, by the module that is missing."""
 _FORWARDED = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 
@@ -47,10 +55,11 @@ def main() -> None:
         sys.stderr.write(f"error: {_message(err)}\n")
         sys.exit(1)
     except ImportError as err:
-        if debug or err.name not in ("torch", "safetensors"):
+        if debug or err.name not in _EXTRAS:
             raise
+        what, extra = _EXTRAS[err.name]
         sys.stderr.write(
-            "error: this command needs PyTorch: pip install 'semantic2d-dataset[torch]'\n"
+            f"error: this command needs {what}: pip install 'semantic2d-dataset[{extra}]'\n"
         )
         sys.exit(1)
     except (KeyboardInterrupt, SystemExit) as end:

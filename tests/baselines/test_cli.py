@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +12,14 @@ from typer.testing import CliRunner
 from baselines.checkpoints import load_checkpoint
 from baselines.cli import app
 from semantic2d_dataset import open_dataset
-from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError, Semantic2DError
+from semantic2d_dataset.errors import (
+    DatasetNotFoundError,
+    InvalidInputError,
+    Semantic2DError,
+    WriteError,
+)
 from semantic2d_dataset.scoring.submission import score_predictions
+from tests.conftest import PROJECT
 
 
 def run(*words: object) -> str:
@@ -128,3 +135,48 @@ def test_listing_the_commands_imports_nothing_heavy():
     code = "import sys, baselines.cli; print({'torch', 'numba', 'h5py'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_a_model_goes_to_a_robot_and_labels_a_recording(
+    model: Path, dataset_folder: Path, tmp_path: Path
+):
+    onnx, source = tmp_path / "model.onnx", dataset_folder / "sequences/lobby--first--small.h5"
+    said = json.loads(run("export", model, "--onnx", "--out", onnx, "--json"))
+    assert said["bytes"] == onnx.stat().st_size
+    assert said["difference"] < 1e-4
+    for name, given in (("run.h5", model), ("onnx.h5", onnx)):
+        words = ("label", source, "--model", given, "--samples", 2, "--out", tmp_path / name)
+        said = json.loads(run(*words, "--json"))
+        assert said["scans"] == 150
+        assert sum(said["points"].values()) > 0.8 * 150 * 37
+        with pytest.raises(InvalidInputError, match="exists already"):
+            run(*words)
+        assert "points labelled: Other" in run(*words, "--force")
+
+
+def test_export_says_what_it_needs(model: Path, tmp_path: Path):
+    with pytest.raises(InvalidInputError, match="say as what to write the model: --onnx"):
+        run("export", model, "--out", tmp_path / "m.onnx")
+    with pytest.raises(WriteError, match="does not exist"):
+        run("export", model, "--onnx", "--out", tmp_path / "no" / "m.onnx")
+    with pytest.raises(DatasetNotFoundError, match="no trained model here"):
+        run("export", tmp_path, "--onnx", "--out", tmp_path / "m.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_package_is_one_line_that_says_what_to_install(model: Path, tmp_path: Path):
+    code = (
+        "import sys; sys.modules['onnxscript'] = None; from semantic2d_dataset.cli import main; "
+        f"sys.argv[1:] = ['baseline', 'export', {str(model)!r}, '--onnx', '--out', 'm.onnx']; "
+        "main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(PROJECT)},
+    )
+    message = "error: this command needs ONNX: pip install 'semantic2d-dataset[onnx]'\n"
+    assert (done.returncode, done.stderr) == (1, message)
