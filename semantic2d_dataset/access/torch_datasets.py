@@ -116,7 +116,10 @@ class LidarDataset(Dataset[Batch]):
         self.features = None if features is None else normalise_features(features)
         self.transform, self.transform_seed = transform, transform_seed
         self._buffers = Buffers()
-        self.source = ScanSource(data, lidar=name, split=split, scheme=scheme, in_memory=in_memory)
+        self._measured_by = name
+        self.source = self.open_source(
+            data, lidar=name, split=split, scheme=scheme, in_memory=in_memory
+        )
         if "I" in (self.features or "") and not self.source.has_intensities:
             raise InvalidInputError(
                 f"{data.manifest.name}: {self.lidar.name} gives no intensities; leave I out of "
@@ -134,6 +137,10 @@ class LidarDataset(Dataset[Batch]):
     def from_path(cls, path: str | Path, **options: Any) -> Self:
         """Open one's own data set by its folder; options as for the class."""
         return cls(open_dataset(Path(path)), **options)
+
+    def open_source(self, data: OpenDataset, **options: Any) -> ScanSource:
+        """Open the scans of a split; a subclass may give them another geometry."""
+        return ScanSource(data, **options)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -204,9 +211,9 @@ class LidarDataset(Dataset[Batch]):
         source = self.source
         if source.split == "train":
             return source
-        return ScanSource(
+        return self.open_source(
             source.data,
-            lidar=source.lidar.name,
+            lidar=self._measured_by,
             split="train",
             scheme=source.scheme,
             in_memory=False,
