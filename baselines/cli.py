@@ -332,6 +332,47 @@ def label(
     _report({"sequence": str(out)} | asdict(summary), text, as_json=as_json)
 
 
+@app.command()
+def transfer(
+    out: Annotated[Path, typer.Option("--out", help="Folder for models, scores and picture.")],
+    data: Data = "semantic2d-mini",
+    lidars: Annotated[
+        str | None, typer.Option(help="Names with commas between; all of the data set's.")
+    ] = None,
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    preset: Annotated[str, typer.Option(help="Settings to start from: quick or paper.")] = "paper",
+    model: Annotated[str, typer.Option(help="What to train.")] = "s3net",
+    features: Annotated[str | None, typer.Option(help="Letters of R, I, P, A.")] = None,
+    epochs: Annotated[int | None, typer.Option(help="Of each training from scratch.")] = None,
+    tuning_epochs: Annotated[
+        int | None, typer.Option(help="Of each fine-tuning; a quarter of --epochs, if not given.")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="Latents drawn for each scan.")] = 32,
+    seed: Annotated[int | None, typer.Option(help="Of weights, order and latents.")] = None,
+    device: Device = None,
+    *,
+    as_json: Json = False,
+) -> None:
+    """Train on every lidar, test on every other, as it is and fine-tuned on the val split.
+
+    Run again after an interruption, it goes on where --out stopped.
+    """
+    from baselines.architectures import check_model
+    from baselines.transfer import TransferStudy, fine_tuning_of, lidars_of, measure_transfer
+    from baselines.transfer_report import describe_transfer, format_transfer, write_transfer
+    from semantic2d_dataset.access.registry import open_dataset
+
+    check_model(model)
+    config = _config(preset, model=model, features=features, epochs=epochs, seed=seed)
+    opened = open_dataset(data)
+    names = lidars_of(opened) if lidars is None else [n.strip() for n in lidars.split(",")]
+    tuning = fine_tuning_of(config, tuning_epochs)
+    study = TransferStudy(opened, names, config, tuning, scheme, samples)
+    found = measure_transfer(study, out, device=_device(device))
+    write_transfer(out, study, found)
+    _report(describe_transfer(study, found), format_transfer(study, found), as_json=as_json)
+
+
 def _check_free(path: Path, *, force: bool) -> None:
     if path.exists() and not force:
         raise InvalidInputError(f"{path}: exists already; choose another, or pass --force")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from baselines.checkpoints import Checkpoint
-from baselines.inference import SAMPLES, SampledLabels, infer_scans
+from baselines.inference import SAMPLES, infer_scans
 from baselines.speed import frames_per_second, processor_name
 from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
 from semantic2d_dataset.format.writing import write_text_atomically
