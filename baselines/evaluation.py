@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from baselines.checkpoints import Checkpoint
 from baselines.inference import SAMPLES, infer_scans
+from baselines.sampled_labels import SampledLabels
 from baselines.speed import frames_per_second, processor_name
 from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
 from semantic2d_dataset.format.writing import write_text_atomically
