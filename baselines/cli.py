@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -371,6 +372,51 @@ def transfer(
     found = measure_transfer(study, out, device=_device(device))
     write_transfer(out, study, found)
     _report(describe_transfer(study, found), format_transfer(study, found), as_json=as_json)
+
+
+@app.command()
+def reproduce(
+    experiment: Annotated[
+        str, typer.Argument(help="What to reproduce: table-segmentation or ablation.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder for models, tables and pictures.")],
+    data: Data = "semantic2d-mini",
+    lidar: Annotated[str, typer.Option(help="Whose scans.")] = "hokuyo",
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    preset: Annotated[str, typer.Option(help="Settings of training: quick or paper.")] = "quick",
+    epochs: Annotated[int | None, typer.Option(help="Passes over the training split.")] = None,
+    seeds: Annotated[str, typer.Option(help="Of the trainings, such as 0,1,2.")] = "0",
+    samples: Annotated[int, typer.Option(min=1, help="Latents drawn for each scan.")] = 32,
+    device: Device = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Trainings at a time.")] = 1,
+    *,
+    as_json: Json = False,
+) -> None:
+    """Train and score all that a table of the paper holds, and print it with what was published.
+
+    What is done in --out stays, so that the same command goes on where it was stopped.
+    """
+    from baselines import experiments
+    from baselines.reporting import write_report
+    from baselines.reproduction import Settings, run_experiment
+    from baselines.tables import to_text
+
+    chosen = experiments.find_experiment(experiment)
+    settings = Settings(
+        data,
+        scheme,
+        lidar,
+        _config(preset, epochs=epochs),
+        experiments.parse_seeds(seeds),
+        samples,
+        _device(device),
+    )
+    results = run_experiment(
+        chosen, settings, out / "runs", jobs=jobs, tell=partial(typer.echo, err=True)
+    )
+    table = write_report(chosen, settings, results, out / chosen.name)
+    said: dict[str, object] = {"results": str(out / chosen.name / "results.json")}
+    _report(said, f"{to_text(table)}\n{out / chosen.name}: written", as_json=as_json)
 
 
 def _check_free(path: Path, *, force: bool) -> None:

@@ -180,3 +180,45 @@ def test_a_missing_package_is_one_line_that_says_what_to_install(model: Path, tm
     )
     message = "error: this command needs ONNX: pip install 'semantic2d-dataset[onnx]'\n"
     assert (done.returncode, done.stderr) == (1, message)
+
+
+def test_a_reproduced_table_is_printed_and_written_in_three_formats_with_pictures(
+    dataset_folder: Path, tmp_path: Path
+):
+    usual = ("--data", dataset_folder, "--lidar", "small", "--epochs", 1, "--samples", 2)
+    text = run("reproduce", "table-segmentation", *usual, "--out", tmp_path)
+    folder = tmp_path / "table-segmentation"
+    assert {path.name for path in folder.iterdir()} == {
+        *("table.txt", "table.md", "table.tex", "results.json"),
+        *("miou_by_features.png", "iou_by_class.png"),
+    }
+    assert text.startswith((folder / "table.txt").read_text())
+    said = json.loads((folder / "results.json").read_text())
+    for method in ("S3-Net (R)", "S3-Net (R+I+P+A)"):
+        ours, published = [row for row in said["rows"] if row["method"] == method]
+        assert (ours["published"], published["published"]) == (False, True)
+        assert (ours["ranked"], published["ranked"]) == (True, False)
+        lines = (folder / "table.md").read_text().count(f"{method} |"), text.count(f"{method} †")
+        assert lines == (1, 1)
+    assert published["figures"]["IoU"]["All"] == [0.2565, 0.0075]
+    assert "one thread" in text
+    assert "Intel i5-8250U" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("ablation", "--seeds", "a"), "seeds: expected different whole numbers from 0"),
+        (("other",), "unknown experiment 'other'; known are table-segmentation, ablation"),
+        (("ablation", "--preset", "best"), "unknown preset 'best'"),
+        (("ablation", "--scheme", "none"), "unknown scheme 'none'"),
+        (("ablation", "--lidar", "none"), "no sequence of the lidar 'none'"),
+    ],
+)
+def test_what_cannot_be_reproduced_is_one_clear_error_and_no_file(
+    words, message: str, dataset_folder: Path, tmp_path: Path
+):
+    usual = ("--data", dataset_folder, "--lidar", "small")
+    with pytest.raises(Semantic2DError, match=message):
+        run("reproduce", words[0], *usual, "--out", tmp_path / "out", *words[1:])
+    assert not (tmp_path / "out").exists()
