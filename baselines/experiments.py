@@ -22,7 +22,10 @@ MAIN_FEATURES = ("R", "RI", "RIA")
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One training: a model, the letters of its features, the lidar and the seed."""
+    """One training: a model, the letters of its features, the lidar and the seed.
+
+    A method that learns nothing has no features; it is scored only.
+    """
 
     model: str
     features: str
@@ -32,7 +35,8 @@ class RunSpec:
     @property
     def name(self) -> str:
         """The name of its folder."""
-        return f"{self.model}-{self.features}-{self.lidar}-seed{self.seed}"
+        what = f"{self.model}-{self.features}" if self.features else self.model
+        return f"{what}-{self.lidar}-seed{self.seed}"
 
 
 @dataclass(frozen=True)

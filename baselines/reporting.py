@@ -65,11 +65,12 @@ def _row(runs: Sequence[RunResult]) -> Row:
     seeds = f", {len(runs)} seeds" if len(runs) > 1 else ""
     speed = median(run.speed["one_pass"] for run in runs)
     figures = {metric: _merge([run.figures[metric] for run in runs]) for metric in METRICS}
-    return Row(_title(runs[0]) + seeds, speed, figures)
+    return Row(_title(runs[0]) + seeds, speed, figures, ranked=bool(runs[0].spec.features))
 
 
 def _title(run: RunResult) -> str:
-    return f"{run.title} ({'+'.join(run.spec.features)})"
+    features = "+".join(run.spec.features)
+    return f"{run.title} ({features})" if features else run.title
 
 
 def _merge(rows: Sequence[ClassFigures]) -> ClassFigures:
@@ -84,7 +85,7 @@ def _merge(rows: Sequence[ClassFigures]) -> ClassFigures:
 
 
 def _published_row(run: RunResult) -> Row | None:
-    row = published_segmentation().find(run.title, run.spec.features)
+    row = published_segmentation().find(run.title, run.spec.features or None)
     if row is None:
         return None
     return Row(_title(run), row.frames_per_second, row.figures, published=True, ranked=False)
@@ -138,10 +139,6 @@ def _draw(results: Results, table: Table, folder: Path) -> None:
         name: row for name, runs in by_features.items() if (row := _published_row(runs[0]))
     }
     save(plot_features(ours, published), folder / "miou_by_features.png")
-    main = [
-        _row(runs)
-        for method, runs in results.items()
-        if method.features in MAIN_FEATURES or method.model != S3Net.name
-    ]
+    main = [_row(runs) for method, runs in results.items() if method.features in MAIN_FEATURES]
     best = published.get("+".join(MAIN_FEATURES[-1]))
     save(plot_classes([*main, *filter(None, [best])], table.classes), folder / "iou_by_class.png")

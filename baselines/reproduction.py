@@ -151,7 +151,7 @@ class _Run:
     @property
     def task(self) -> dict[str, Any]:
         """All that its result depends on, as plain values."""
-        config = asdict(self.settings.config_of(self.spec))
+        config = asdict(self.settings.config_of(self.spec)) if self.spec.features else {}
         said = {"lidar": self.spec.lidar, **self.dataset, "samples": self.settings.samples}
         return dict(json.loads(json.dumps(said | config)))
 

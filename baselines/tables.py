@@ -33,7 +33,7 @@ class Row:
         Whether they are as published, and so from other data.
     ranked
         Whether they may be the best of a column: not what is published, nor what is scored on
-        merged classes.
+        some classes only.
     """
 
     method: str
