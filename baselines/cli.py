@@ -377,7 +377,7 @@ def transfer(
 @app.command()
 def reproduce(
     experiment: Annotated[
-        str, typer.Argument(help="What to reproduce: table-segmentation or ablation.")
+        str, typer.Argument(help="What to reproduce: table-segmentation, ablation or transfer.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for models, tables and pictures.")],
     data: Data = "semantic2d-mini",
@@ -401,6 +401,19 @@ def reproduce(
     from baselines.reproduction import Settings, run_experiment
     from baselines.tables import to_text
 
+    if experiment == experiments.TRANSFER:
+        transfer(
+            out / "transfer",
+            data,
+            scheme=scheme,
+            preset=preset,
+            epochs=epochs,
+            samples=samples,
+            seed=experiments.parse_seeds(seeds)[0],
+            device=device,
+            as_json=as_json,
+        )
+        return
     chosen = experiments.find_experiment(experiment)
     settings = Settings(
         data,

@@ -7,6 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from itertools import combinations
 
 from baselines.architectures import ARCHITECTURES
+from baselines.detectors import DETECTORS
 from baselines.s3net import S3Net
 from semantic2d_dataset.access.features import FEATURES
 from semantic2d_dataset.errors import InvalidInputError
@@ -18,6 +19,9 @@ COMBINATIONS = tuple(
 
 MAIN_FEATURES = ("R", "RI", "RIA")
 """The combinations that the paper's findings and pictures are about."""
+
+TRANSFER = "transfer"
+"""The experiment across lidars, which `transfer.measure_transfer` runs."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
             "table-segmentation",
             "Segmentation results",
             (
+                *(Method(name, "", every_seed=False) for name in DETECTORS),
                 *(
                     Method(S3Net.name, letters, every_seed=letters in MAIN_FEATURES)
                     for letters in COMBINATIONS
@@ -107,7 +112,8 @@ def find_experiment(name: str) -> Experiment:
         If there is none of that name.
     """
     if name not in EXPERIMENTS:
-        raise InvalidInputError(f"unknown experiment {name!r}; known are {', '.join(EXPERIMENTS)}")
+        known = ", ".join((*EXPERIMENTS, TRANSFER))
+        raise InvalidInputError(f"unknown experiment {name!r}; known are {known}")
     return EXPERIMENTS[name]
 
 

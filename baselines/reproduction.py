@@ -23,11 +23,14 @@ from tqdm import tqdm
 
 from baselines.checkpoints import load_checkpoint
 from baselines.configs import TrainingConfig
+from baselines.detector_scores import score_detector
+from baselines.detectors import DETECTORS
 from baselines.evaluation import ALL_CLASSES, Evaluation, evaluate
 from baselines.experiments import Experiment, Method, RunSpec
 from baselines.inference import SAMPLES
 from baselines.training import train
 from semantic2d_dataset.access.registry import open_dataset
+from semantic2d_dataset.access.scan_source import ScanSource
 from semantic2d_dataset.access.torch_datasets import load_dataset
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.executors import open_executor
@@ -267,9 +270,20 @@ def _do(run: _Run) -> RunResult:
     run.folder.mkdir(exist_ok=True)
     write_text_atomically(run.folder / _TASK, json.dumps(run.task, indent=1) + "\n")
     with _one_thread(), _no_bars() if run.beside > 1 else contextlib.nullcontext():
-        result = _train_and_evaluate(run)
+        result = _detect(run) if run.spec.model in DETECTORS else _train_and_evaluate(run)
     write_text_atomically(run.folder / _RESULT, json.dumps(asdict(result), indent=1) + "\n")
     return result
+
+
+def _detect(run: _Run) -> RunResult:
+    settings, spec = run.settings, run.spec
+    detector, data = DETECTORS[spec.model], open_dataset(settings.data)
+    source = ScanSource(data, lidar=spec.lidar, split="test", scheme=settings.scheme)
+    found = score_detector(detector, source)
+    classes = tuple(source.taxonomy.names[c] for c in source.taxonomy.scored_ids)
+    return RunResult(
+        spec, detector.method, classes, found.figures, found.result, found.speed, run.beside, 0.0
+    )
 
 
 def _train_and_evaluate(run: _Run) -> RunResult:

@@ -201,6 +201,7 @@ def test_a_reproduced_table_is_printed_and_written_in_three_formats_with_picture
         lines = (folder / "table.md").read_text().count(f"{method} |"), text.count(f"{method} †")
         assert lines == (1, 1)
     assert published["figures"]["IoU"]["All"] == [0.2565, 0.0075]
+    assert text.count("Line extraction †") == text.count("Leg detection †") == 1
     assert "one thread" in text
     assert "Intel i5-8250U" in text
 
