@@ -111,7 +111,9 @@ def plain_step(scans: int) -> Callable[[], object]:
     return step
 
 
-def our_step(scans: int, micro_batch: int | None) -> Callable[[], object]:
+def our_step(
+    scans: int, micro_batch: int | None = None, *, bf16: bool = False
+) -> Callable[[], object]:
     from baselines.s3net import S3Net
     from baselines.steps import keep_freed_memory, momentum_of_micro_batches, step
 
@@ -125,7 +127,9 @@ def our_step(scans: int, micro_batch: int | None) -> Callable[[], object]:
         torch.ones(CLASSES),
         (1, 1, 0.01),
     )
-    return lambda: step(network, optimiser, batch, weights, betas=betas, micro_batch=micro_batch)
+    return lambda: step(
+        network, optimiser, batch, weights, betas=betas, micro_batch=micro_batch, bf16=bf16
+    )
 
 
 def plain_inference(scans: int) -> Callable[[], object]:
@@ -154,8 +158,10 @@ def measure(way: str, scans: int) -> float:
     """Scans per second, the median of three runs after one that warms up."""
     run = {
         "plain step": lambda: plain_step(scans),
-        "our step": lambda: our_step(scans, None),
+        "our step": lambda: our_step(scans),
+        "our step in 16 bits": lambda: our_step(scans, bf16=True),
         "our step in parts of 32": lambda: our_step(scans, 32),
+        "our step in parts of 128": lambda: our_step(scans, 128),
         "plain inference": lambda: plain_inference(scans),
         "our inference": lambda: our_inference(scans),
     }[way]()
@@ -192,7 +198,11 @@ def main() -> None:
         print(measure(given.way, given.batch))
         return
     threads = ["--threads", str(given.threads)]
-    steps = ("plain step", "our step", "our step in parts of 32")
+    ours = (
+        "our step",
+        *(f"our step in {how}" for how in ("16 bits", "parts of 128", "parts of 32")),
+    )
+    steps = ("plain step", *ours)
     compare(steps, given.rounds, [*threads, "--batch", str(given.batch)])
     compare(("plain inference", "our inference"), given.rounds, [*threads, "--batch", "32"])
 
