@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from semantic2d_dataset.access.features import normalise_features
 from semantic2d_dataset.errors import InvalidInputError
@@ -117,3 +119,12 @@ PRESETS: Mapping[str, Callable[[], TrainingConfig]] = {
     "quick": TrainingConfig.quick,
     "paper": TrainingConfig.paper,
 }
+
+
+def changed_settings(now: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
+    """Name the settings, as plain values of JSON, that differ from those of an earlier run.
+
+    A setting that the earlier run does not know had its default then.
+    """
+    defaults = json.loads(json.dumps(asdict(TrainingConfig())))
+    return [key for key in now if now[key] != before.get(key, defaults.get(key))]

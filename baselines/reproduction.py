@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from baselines.checkpoints import load_checkpoint
-from baselines.configs import TrainingConfig
+from baselines.configs import TrainingConfig, changed_settings
 from baselines.detector_scores import score_detector
 from baselines.detectors import DETECTORS
 from baselines.evaluation import ALL_CLASSES, Evaluation, evaluate
@@ -256,7 +256,7 @@ def _check_task(run: _Run) -> None:
         before = dict(load_json(path.read_bytes()))
     except (ValueError, TypeError) as err:
         raise CorruptFileError(f"{path}: damaged; delete {run.folder} to run again") from err
-    changed = [key for key in run.task if run.task[key] != before.get(key)]
+    changed = changed_settings(run.task, before)
     if changed:
         key = changed[0]
         raise InvalidInputError(

@@ -26,7 +26,7 @@ from baselines.checkpoints import (
     save_checkpoint,
     write_state,
 )
-from baselines.configs import TrainingConfig, learning_rate_at
+from baselines.configs import TrainingConfig, changed_settings, learning_rate_at
 from baselines.losses import median_frequency_weights
 from baselines.networks import SegmentationNetwork
 from baselines.steps import keep_freed_memory, momentum_of_micro_batches, step
@@ -362,7 +362,7 @@ def _restore(run: _Run, config: TrainingConfig, dataset: LabelledScans, folder: 
     now = json.loads(json.dumps(asdict(config) | {"statistics": asdict(dataset.statistics)}))
     try:
         before = said["config"] | {"statistics": said["statistics"]}
-        changed = [key for key in now if now[key] != before.get(key)]
+        changed = changed_settings(now, before)
         log, seconds = list(said["log"]), float(said["log"][-1]["seconds"])
     except (KeyError, TypeError, IndexError, ValueError) as err:
         raise CorruptFileError(f"{folder}: the state to resume from is damaged: {err!r}") from err

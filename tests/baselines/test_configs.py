@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 
-from baselines.configs import PRESETS, TrainingConfig, learning_rate_at
+from baselines.configs import PRESETS, TrainingConfig, changed_settings, learning_rate_at
 from semantic2d_dataset.errors import InvalidInputError
 
 
@@ -48,3 +50,10 @@ def test_one_cycle_rises_to_the_learning_rate_and_ends_at_zero():
 def test_a_constant_schedule_stays():
     config = TrainingConfig()
     assert {learning_rate_at(config, p) for p in (0.0, 0.5, 1.0)} == {1e-4}
+
+
+def test_a_setting_that_an_earlier_run_did_not_know_had_its_default():
+    before = asdict(TrainingConfig())
+    del before["bf16"]
+    assert changed_settings(asdict(TrainingConfig()), before) == []
+    assert changed_settings(asdict(TrainingConfig(bf16=True, seed=1)), before) == ["seed", "bf16"]
