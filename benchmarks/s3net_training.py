@@ -111,6 +111,13 @@ def plain_step(scans: int) -> Callable[[], object]:
     return step
 
 
+def tuned_plain_step(scans: int) -> Callable[[], object]:
+    from baselines.steps import keep_freed_memory
+
+    keep_freed_memory()
+    return plain_step(scans)
+
+
 def our_step(
     scans: int, micro_batch: int | None = None, *, bf16: bool = False
 ) -> Callable[[], object]:
@@ -158,6 +165,7 @@ def measure(way: str, scans: int) -> float:
     """Scans per second, the median of three runs after one that warms up."""
     run = {
         "plain step": lambda: plain_step(scans),
+        "plain step, tuned malloc": lambda: tuned_plain_step(scans),
         "our step": lambda: our_step(scans),
         "our step in 16 bits": lambda: our_step(scans, bf16=True),
         "our step in parts of 32": lambda: our_step(scans, 32),
