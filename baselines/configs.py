@@ -41,6 +41,9 @@ class TrainingConfig:
         loss).
     class_weight_power
         Median-frequency weights are raised to this power: 1 as published, 0 for equal classes.
+    frozen_norms
+        Batch norms use the running statistics that the network starts with and keep them, for
+        fine-tuning: those of a few scans that look otherwise would undo what was learnt.
     seed
         Of weights, order of scans and latents.
     bf16
@@ -62,6 +65,7 @@ class TrainingConfig:
     schedule: str = "constant"
     betas: tuple[float, float, float] = (1.0, 1.0, 0.01)
     class_weight_power: float = 1.0
+    frozen_norms: bool = False
     seed: int = 0
     bf16: bool = False
     augment: bool = False

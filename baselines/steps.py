@@ -91,6 +91,13 @@ def momentum_of_micro_batches(network: nn.Module, batch_size: int, micro_batch: 
             layer.momentum = 1 - (1 - _BATCH_NORM_MOMENTUM) ** (1 / parts)
 
 
+def freeze_norms(network: nn.Module) -> None:
+    """Let batch norms of a network in training use their running statistics, and keep them."""
+    for layer in network.modules():
+        if isinstance(layer, nn.modules.batchnorm._BatchNorm):  # noqa: SLF001 - of every dimension
+            layer.eval()
+
+
 def keep_freed_memory() -> None:
     """Tell glibc to reuse the memory of a step in the next one.
 

@@ -29,7 +29,7 @@ from baselines.checkpoints import (
 from baselines.configs import TrainingConfig, changed_settings, learning_rate_at
 from baselines.losses import median_frequency_weights
 from baselines.networks import SegmentationNetwork
-from baselines.steps import keep_freed_memory, momentum_of_micro_batches, step
+from baselines.steps import freeze_norms, keep_freed_memory, momentum_of_micro_batches, step
 from baselines.team import Team, join_team
 from semantic2d_dataset.access.features import Statistics, channel_count
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
@@ -263,6 +263,8 @@ def _train_epoch(
     sums: dict[str, float] = {}
     scans, rate = 0, 0.0
     run.network.train()
+    if config.frozen_norms:
+        freeze_norms(run.network)
     for i, batch in enumerate(loader):
         rate = learning_rate_at(config, clock.progress(done + i / len(loader)))
         for group in run.optimiser.param_groups:
