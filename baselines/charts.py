@@ -37,6 +37,7 @@ def plot_features(ours: Mapping[str, Row], published: Mapping[str, Row]) -> Figu
         _draw_bars(ax, at + offset, 0.38, figures, label=label, **style)
     ax.set_xticks(at, list(ours), rotation=30, ha="right", rotation_mode="anchor")
     ax.set_ylabel("mIoU (%)")
+    ax.set_ylim(bottom=0)
     figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
 
@@ -61,6 +62,7 @@ def plot_classes(rows: Sequence[Row], classes: Sequence[str]) -> Figure:
         _draw_bars(ax, at + offset, 0.92 * width, figures, label=label, **style)
     ax.set_xticks(at, classes)
     ax.set_ylabel("IoU (%)")
+    ax.set_ylim(bottom=0)
     figure.legend(loc="outside upper center", ncols=3, frameon=False)
     return figure
 
@@ -81,7 +83,6 @@ def _draw_bars(
     )
     lines = {"ecolor": "0.25", "elinewidth": 0.8, "capsize": 2}
     ax.bar(at, 100 * heights, width, yerr=100 * spreads, error_kw=lines, **style)
-    ax.set_ylim(bottom=0)
 
 
 def _new_figure(width: float) -> tuple[Figure, Axes]:
