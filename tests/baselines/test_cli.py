@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from baselines import speed
 from baselines.checkpoints import load_checkpoint
 from baselines.cli import app
 from semantic2d_dataset import open_dataset
@@ -183,8 +184,9 @@ def test_a_missing_package_is_one_line_that_says_what_to_install(model: Path, tm
 
 
 def test_a_reproduced_table_is_printed_and_written_in_three_formats_with_pictures(
-    dataset_folder: Path, tmp_path: Path
+    dataset_folder: Path, tmp_path: Path, monkeypatch
 ):
+    monkeypatch.setattr(speed, "_SECONDS", 0.01)
     usual = ("--data", dataset_folder, "--lidar", "small", "--epochs", 1, "--samples", 2)
     text = run("reproduce", "table-segmentation", *usual, "--out", tmp_path)
     folder = tmp_path / "table-segmentation"
