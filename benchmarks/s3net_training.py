@@ -206,11 +206,9 @@ def main() -> None:
         print(measure(given.way, given.batch))
         return
     threads = ["--threads", str(given.threads)]
-    ours = (
-        "our step",
-        *(f"our step in {how}" for how in ("16 bits", "parts of 128", "parts of 32")),
-    )
-    steps = ("plain step", *ours)
+    ways = ("16 bits", "parts of 128", "parts of 32")
+    plain = ("plain step", "plain step, tuned malloc")
+    steps = (*plain, "our step", *(f"our step in {way}" for way in ways))
     compare(steps, given.rounds, [*threads, "--batch", str(given.batch)])
     compare(("plain inference", "our inference"), given.rounds, [*threads, "--batch", "32"])
 
