@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,22 @@ def _read(path: Path) -> bytes:
         raise CorruptFileError(f"{path}: expected weights that torch.save wrote, found {found}")
     if size > _LARGEST:
         raise UnsafeFileError(f"{path}: {size} bytes; an S3-Net never takes above {_LARGEST}")
-    return path.read_bytes()
+    content = path.read_bytes()
+    unpacked = _unpacked_size(content)
+    if unpacked > _LARGEST:
+        raise UnsafeFileError(
+            f"{path}: unpacks to {unpacked} bytes; an S3-Net never takes above {_LARGEST}"
+        )
+    return content
+
+
+def _unpacked_size(content: bytes) -> int:
+    """Bytes that torch's reader would take: it inflates what is compressed, of any size."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, NotImplementedError, ValueError):
+        return len(content)  # an older form, or damaged, as its reader will tell
 
 
 def _unpickle(path: Path, content: bytes) -> Any:
@@ -140,7 +156,7 @@ def _weights_of(path: Path, held: object) -> dict[str, Tensor]:
     """Return the weights by their names in S3Net."""
     for key in _WEIGHTS:
         weights = held.get(key) if isinstance(held, dict) else None
-        if isinstance(weights, dict) and all(_is_dense(w) for w in weights.values()):
+        if isinstance(weights, dict) and all(_has_values(w) for w in weights.values()):
             # a network that was spread over several GPUs carries a prefix
             return {str(name).removeprefix("module."): w for name, w in weights.items()}
     found = (
@@ -153,8 +169,15 @@ def _weights_of(path: Path, held: object) -> dict[str, Tensor]:
     )
 
 
-def _is_dense(weight: object) -> bool:
-    return isinstance(weight, Tensor) and weight.layout == torch.strided
+def _has_values(weight: object) -> bool:
+    """Tell whether something is a tensor whose plain numbers are in memory."""
+    return (
+        isinstance(weight, Tensor)
+        and weight.layout == torch.strided
+        and weight.device.type == "cpu"
+        and not weight.is_quantized
+        and not weight.is_complex()
+    )
 
 
 def _fitting(path: Path, weights: dict[str, Tensor], network: S3Net) -> dict[str, Tensor]:
@@ -167,7 +190,10 @@ def _fitting(path: Path, weights: dict[str, Tensor], network: S3Net) -> dict[str
         for name, value in expected.items()
         if name in weights and weights[name].shape != value.shape
     ]
-    problems += [f"{name} is not finite" for name, w in weights.items() if not w.isfinite().all()]
+    # a tensor of another shape may be one number, said to be repeated beyond all memory
+    problems = problems or [
+        f"{name} is not finite" for name, w in weights.items() if not w.isfinite().all()
+    ]
     if problems:
         raise CorruptFileError(
             f"{path}: not the weights of an S3-Net of {network.channels} channels and "

@@ -162,6 +162,11 @@ UNREADABLE: dict[str, tuple[Callable[[Path], object], type[Exception], str]] = {
         CorruptFileError,
         "under model or model_state_dict, found the keys weights, epoch, a and 1 more",
     ),
+    "tensors without numbers": (
+        lambda p: torch.save({"model": S3Net().to("meta").state_dict()}, p),
+        CorruptFileError,
+        "with tensors",
+    ),
     "no tensors": (lambda p: torch.save({"model": {"a": 1}}, p), CorruptFileError, "with tensors"),
 }
 
@@ -191,6 +196,14 @@ def test_a_huge_file_is_never_read(tmp_path: Path):
         load_published(tmp_path / "s.pth")
 
 
+def test_a_small_file_that_unpacks_to_a_huge_one_is_never_unpacked(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "s.pth", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes((64 << 20) + 1))
+    assert (tmp_path / "s.pth").stat().st_size < 1 << 20
+    with pytest.raises(UnsafeFileError, match="unpacks to 67108865 bytes"):
+        load_published(tmp_path / "s.pth")
+
+
 HEAD, MEAN = "_encoder._encoder._conv_1.0.weight", "_encoder._encoder_z_mu.bias"
 
 
@@ -199,6 +212,7 @@ HEAD, MEAN = "_encoder._encoder._conv_1.0.weight", "_encoder._encoder_z_mu.bias"
     [
         ({MEAN: None}, f"{MEAN} is missing"),
         ({"extra": torch.zeros(1)}, "extra is unknown"),
+        ({"extra": torch.zeros(1).expand(1 << 44)}, "extra is unknown"),
         ({HEAD: torch.zeros(32, 2, 4)}, r"\(32, 2, 4\) instead of \(32, 3, 4\)"),
         ({MEAN: torch.tensor([float("nan")])}, f"{MEAN} is not finite"),
     ],
