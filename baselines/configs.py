@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from baselines.sampled_labels import check_seed
 from semantic2d_dataset.access.features import normalise_features
 from semantic2d_dataset.errors import InvalidInputError
 
@@ -76,10 +77,15 @@ class TrainingConfig:
         object.__setattr__(self, "betas", tuple(self.betas))
         for name in ("epochs", "batch_size", "micro_batch", "learning_rate", "time_limit_s"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if value is not None and not 0 < value < math.inf:
                 raise InvalidInputError(f"{name}: expected above 0, found {value}")
         if len(self.betas) != 3:
             raise InvalidInputError(f"betas: expected 3 weights, found {len(self.betas)}")
+        numbers = {"weight_decay": self.weight_decay, "class_weight_power": self.class_weight_power}
+        for name, value in (*numbers.items(), *(("betas", beta) for beta in self.betas)):
+            if not 0 <= value < math.inf:
+                raise InvalidInputError(f"{name}: expected 0 or more, found {value}")
+        check_seed(self.seed)
         if self.schedule not in ("constant", "one-cycle"):
             raise InvalidInputError(
                 f"unknown schedule {self.schedule!r}; known are constant and one-cycle"

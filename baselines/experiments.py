@@ -9,6 +9,7 @@ from itertools import combinations
 from baselines.architectures import ARCHITECTURES
 from baselines.detectors import DETECTORS
 from baselines.s3net import S3Net
+from baselines.sampled_labels import SEEDS
 from semantic2d_dataset.access.features import FEATURES
 from semantic2d_dataset.errors import InvalidInputError
 
@@ -128,7 +129,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     words = [word.strip() for word in text.split(",")]
     plain = all(word.isascii() and word.isdigit() for word in words)
     seeds = tuple(int(word) for word in words) if plain else ()
-    if not seeds or len(set(seeds)) != len(seeds) or max(seeds) >= 2**32:
+    if not seeds or len(set(seeds)) != len(seeds) or max(seeds) >= SEEDS:
         raise InvalidInputError(
             f"seeds: expected different whole numbers from 0, such as 0,1,2; found {text!r}"
         )

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from baselines.checkpoints import Checkpoint
 from baselines.networks import Latent, SegmentationNetwork
 from baselines.s3net import S3Net
-from baselines.sampled_labels import SampledLabels
+from baselines.sampled_labels import SampledLabels, check_draw
 from baselines.steps import keep_freed_memory
 from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
 from semantic2d_dataset.errors import InvalidInputError
@@ -50,10 +50,9 @@ def infer(
     Raises
     ------
     InvalidInputError
-        If there is no sample to draw, or the features have another shape.
+        If there is no sample to draw, the seed is out of range, or the features have another shape.
     """
-    if samples < 1:
-        raise InvalidInputError(f"samples: expected at least 1, found {samples}")
+    check_draw(samples, seed)
     with torch.inference_mode():
         if isinstance(network, S3Net):
             chosen, votes, probabilities, own = _sample(network, features, samples, seed)
@@ -115,8 +114,10 @@ def infer_scans(
     Raises
     ------
     InvalidInputError
-        If the data set does not fit the model.
+        If the data set does not fit the model, there is no sample to draw, or the seed is out of
+        range.
     """
+    check_draw(samples, seed)
     _check_dataset(checkpoint, dataset)
     keep_freed_memory()
     device = next(checkpoint.network.parameters()).device
@@ -164,10 +165,12 @@ def predict(
     Raises
     ------
     InvalidInputError
-        If the data set does not fit the model.
+        If the data set does not fit the model, there is no sample to draw, or the seed is out of
+        range.
     WriteError
         If the file cannot be written.
     """
+    check_draw(samples, seed)
     _check_dataset(checkpoint, dataset)
     source = dataset.source
     with (

@@ -7,6 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic2d_dataset.errors import InvalidInputError
+
+SEEDS = 2**32
+"""Seeds are whole numbers from 0 up to this, which every generator takes."""
+
 
 @dataclass(frozen=True)
 class SampledLabels:
@@ -32,6 +37,21 @@ class SampledLabels:
     entropy: NDArray[np.float32]
     mutual_information: NDArray[np.float32]
     samples: NDArray[np.uint8]
+
+
+def check_draw(samples: int, seed: int) -> None:
+    """Raise InvalidInputError if so many samples cannot be drawn from such a seed."""
+    if samples < 1:
+        raise InvalidInputError(f"samples: expected at least 1, found {samples}")
+    check_seed(seed)
+
+
+def check_seed(seed: int) -> None:
+    """Raise InvalidInputError if a number is no seed."""
+    if not 0 <= seed < SEEDS:
+        raise InvalidInputError(
+            f"seed: expected a whole number from 0 to {SEEDS - 1}, found {seed}"
+        )
 
 
 def choose(logits: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from baselines.descriptions import Description
 from baselines.onnx_files import open_session, read_sealed, said_of
-from baselines.sampled_labels import SampledLabels, choose, elect, summarise
+from baselines.sampled_labels import SampledLabels, check_draw, choose, elect, summarise
 from semantic2d_dataset.access.features import features_of
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
@@ -42,7 +42,7 @@ class Segmenter:
     CorruptFileError, FormatVersionError
         If it is damaged or something else, or of a newer major format.
     InvalidInputError
-        If there is no sample or no thread.
+        If there is no sample or no thread, or the seed is out of range.
     ImportError
         If ONNX Runtime is not installed.
 
@@ -55,8 +55,7 @@ class Segmenter:
     def __init__(
         self, path: str | Path, *, samples: int = 1, threads: int = 1, seed: int = 0
     ) -> None:
-        if samples < 1:
-            raise InvalidInputError(f"samples: expected at least 1, found {samples}")
+        check_draw(samples, seed)
         self.path = Path(path)
         self._session = open_session(self.path, read_sealed(self.path), threads)
         self.description = self._describe()

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from baselines.checkpoints import load_checkpoint
 from baselines.inference import infer
-from baselines.sampled_labels import SampledLabels, summarise
+from baselines.sampled_labels import SampledLabels, check_draw, summarise
 from semantic2d_dataset.access.features import features_of
-from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
 
 
@@ -34,14 +33,13 @@ class TorchSegmenter:
     DatasetNotFoundError, CorruptFileError, FormatVersionError
         As `load_checkpoint` does.
     InvalidInputError
-        If there is no sample.
+        If there is no sample, or the seed is out of range.
     """
 
     def __init__(
         self, run: Path, *, samples: int = 1, seed: int = 0, device: str | torch.device = "cpu"
     ) -> None:
-        if samples < 1:
-            raise InvalidInputError(f"samples: expected at least 1, found {samples}")
+        check_draw(samples, seed)
         self.samples, self.seed, self.device = samples, seed, device
         checkpoint = load_checkpoint(run, device=device)
         self.network, self.description = checkpoint.network, checkpoint.description

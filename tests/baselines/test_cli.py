@@ -69,6 +69,7 @@ def test_a_training_with_augmentation_says_so_and_keeps_the_statistics(
         (("s3net", "--features", "RX"), "unknown features 'RX'"),
         (("s3net", "--preset", "best"), "unknown preset 'best'; known are quick, paper"),
         (("s3net", "--epochs", 0), "epochs: expected above 0"),
+        (("s3net", "--seed", -1), "seed: expected a whole number from 0"),
         (("s3net", "--scheme", "none"), "unknown scheme 'none'"),
         (("s3net", "--lidar", "none"), "no sequence of the lidar 'none'"),
         (("s3net", "--data", "nowhere"), "nowhere"),

@@ -108,9 +108,12 @@ def test_one_seed_gives_one_result(network, features):
     assert not np.array_equal(first.samples, other.samples)
 
 
-def test_no_samples_are_refused(network, features):
+def test_no_samples_and_no_seed_are_refused(network, features):
     with pytest.raises(InvalidInputError, match="at least 1, found 0"):
         infer(network, features, samples=0)
+    for seed in (-1, 2**32):
+        with pytest.raises(InvalidInputError, match=f"seed: expected .*, found {seed}"):
+            infer(network, features, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -169,4 +172,6 @@ def test_scans_that_do_not_fit_the_model_are_refused(checkpoint, scans, tmp_path
         predict(other, scans, path)
     with pytest.raises(InvalidInputError, match="features='RI'"):
         predict(replace(checkpoint, features="RI"), scans, path)
+    with pytest.raises(InvalidInputError, match="seed: expected"):
+        predict(checkpoint, scans, path, seed=-1)
     assert not path.exists()

@@ -111,11 +111,13 @@ def test_scans_that_do_not_fit_are_refused(segmenter, ranges, intensities, messa
             method(ranges, intensities)
 
 
-def test_no_sample_and_no_thread_are_refused(small_onnx: Path):
+def test_no_sample_no_thread_and_no_seed_are_refused(small_onnx: Path):
     with pytest.raises(InvalidInputError, match="samples: expected at least 1, found 0"):
         Segmenter(small_onnx, samples=0)
     with pytest.raises(InvalidInputError, match="threads: expected at least 1, found 0"):
         Segmenter(small_onnx, threads=0)
+    with pytest.raises(InvalidInputError, match="seed: expected a whole number"):
+        Segmenter(small_onnx, seed=-1)
 
 
 def test_any_damage_is_noticed(small_onnx: Path, tmp_path: Path):
