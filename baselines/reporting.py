@@ -78,7 +78,7 @@ def _merge(rows: Sequence[ClassFigures]) -> ClassFigures:
     if len(rows) == 1:
         return rows[0]
     merged = {}
-    for name in rows[0]:
+    for name in dict.fromkeys(name for row in rows for name in row):
         means = [row[name][0] for row in rows if name in row]
         merged[name] = (fmean(means), stdev(means) if len(means) > 1 else None)
     return merged
