@@ -83,8 +83,13 @@ def _predict(network: nn.Module, features: Tensor, *, bf16: bool) -> Prediction:
     return Prediction(logits.float(), latent.float(), Latent(*(part.float() for part in law)))
 
 
-def momentum_of_micro_batches(network: nn.Module, batch_size: int, micro_batch: int | None) -> None:
-    """Let batch norms forget as much in the micro-batches of a batch as they would in one."""
+def momentum_of_micro_batches(
+    network: nn.Module, batch_size: float, micro_batch: int | None
+) -> None:
+    """Let batch norms forget as much in the micro-batches of a batch as they would in one.
+
+    `batch_size` is that of the scans of one process, which a team shares unevenly.
+    """
     parts = max(1.0, batch_size / (micro_batch or batch_size))
     for layer in network.modules():
         if isinstance(layer, nn.BatchNorm2d):

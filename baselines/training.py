@@ -228,7 +228,7 @@ def _start(
     network = build_network(config.model, channels, classes, dataset.lidar).to(device)
     if initial is not None:
         _copy_weights(initial, network)
-    momentum_of_micro_batches(network, config.batch_size, config.micro_batch)
+    momentum_of_micro_batches(network, config.batch_size / team.size, config.micro_batch)
     optimiser = torch.optim.Adam(
         network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
@@ -306,8 +306,10 @@ def _to(batch: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
 
 
 def _check_team(team: Team, config: TrainingConfig, scans: int) -> None:
-    if scans < team.size:
-        raise InvalidInputError(f"{scans} scans are too few for {team.size} processes")
+    if min(scans, config.batch_size) < team.size:
+        raise InvalidInputError(
+            f"{scans} scans in batches of {config.batch_size} are too few for {team.size} processes"
+        )
     if team.size > 1 and config.time_limit_s is not None:
         raise InvalidInputError(
             f"{team.size} processes cannot keep one time limit; say how many epochs instead"

@@ -4,13 +4,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
+from baselines import training
 from baselines.checkpoints import load_checkpoint
+from baselines.configs import TrainingConfig
 from baselines.s3net import S3Net
 from baselines.steps import step
 from baselines.team import Team
 from baselines.training import validate
+from semantic2d_dataset.errors import InvalidInputError
 from tests.baselines.generated import ToyScans, make_scans
 from tests.conftest import PROJECT
 
@@ -116,3 +120,19 @@ def test_a_team_refuses_a_time_limit(tmp_path: Path):
     done = run_two(TIMED, tmp_path)
     assert all(process.returncode for process in done)
     assert "2 processes cannot keep one time limit" in done[0].stderr
+
+
+@pytest.mark.parametrize(("scans", "batch_size"), [(2, 8), (8, 2)])
+def test_a_team_that_a_batch_does_not_go_round_is_refused(scans: int, batch_size: int):
+    config = TrainingConfig(batch_size=batch_size)
+    with pytest.raises(InvalidInputError, match="too few for 3 processes"):
+        training._check_team(Team(0, 3), config, scans)
+    training._check_team(Team(0, 2), config, scans)
+
+
+def test_batch_norms_of_a_team_forget_by_the_parts_of_one_share():
+    config = TrainingConfig(batch_size=64, micro_batch=16)
+    for size, momentum in ((4, 0.1), (2, 1 - 0.9 ** (1 / 2)), (1, 1 - 0.9 ** (1 / 4))):
+        run = training._start(config, ToyScans(8), torch.device("cpu"), None, Team(0, size))
+        norms = [m for m in run.network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+        assert [norm.momentum for norm in norms] == pytest.approx([momentum] * 12)
