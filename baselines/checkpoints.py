@@ -6,10 +6,8 @@ that a kill at any moment leaves the old pair or the new one. Nothing is ever un
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,10 +26,9 @@ from semantic2d_dataset.errors import (
     CorruptFileError,
     DatasetNotFoundError,
     InvalidInputError,
-    WriteError,
 )
 from semantic2d_dataset.format.schema import FORMAT_VERSION
-from semantic2d_dataset.format.writing import partial_name, write_text_atomically
+from semantic2d_dataset.format.writing import write_bytes_atomically, write_text_atomically
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 
@@ -141,7 +138,7 @@ def write_state(
     content = safetensors.torch.save({name: t.contiguous().cpu() for name, t in tensors.items()})
     digest = hashlib.sha256(content).hexdigest()
     weights = folder / f"{stem}-{digest[:16]}.safetensors"
-    _write_bytes(weights, content)
+    write_bytes_atomically(weights, content)
     about = {"file": weights.name, "bytes": len(content), "sha256": digest}
     head = {"format": _KIND, "format_version": FORMAT_VERSION}
     write_text_atomically(
@@ -217,18 +214,3 @@ def _understand(said: Mapping[str, Any]) -> Checkpoint:
         about.dataset,
         about.training,
     )
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    partial = partial_name(path)
-    try:
-        with partial.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
-    except OSError as err:
-        raise WriteError(f"{path}: could not be written: {err}") from err
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()

@@ -254,12 +254,20 @@ def remove_stale_partials(path: Path) -> None:
 
 
 def write_text_atomically(path: Path, text: str) -> None:
-    """Write a UTF-8 file so that its name never means half of it."""
+    """Write a UTF-8 file as `write_bytes_atomically` does."""
     write_bytes_atomically(path, text.encode())
 
 
 def write_bytes_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that its name never means half of it."""
+    """Write a file so that its name never means half of it.
+
+    Raises
+    ------
+    WriteError
+        If its folder does not exist, or the disk is full or fails; what was there stays.
+    PermissionError
+        If the folder may not be written to.
+    """
     path = Path(path)
     remove_stale_partials(path)
     partial = partial_name(path)
@@ -269,10 +277,15 @@ def write_bytes_atomically(path: Path, content: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         partial.replace(path)
+    except PermissionError:
+        raise
     except FileNotFoundError as err:
         raise WriteError(f"{path}: the folder {path.parent} does not exist") from err
+    except OSError as err:
+        raise WriteError(f"{path}: could not be written: {err.strerror or err}") from err
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 def root_attributes(schema: FileSchema, **said: str) -> dict[str, str]:

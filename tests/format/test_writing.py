@@ -269,6 +269,22 @@ def test_missing_folder_is_named(tmp_path):
         write_text_atomically(tmp_path / "none" / "a.json", "{}")
 
 
+def test_a_full_disk_is_one_clear_error_and_leaves_what_was_there(tmp_path):
+    path = tmp_path / "a.json"
+    write_text_atomically(path, "one")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))  # bytes of any file
+    try:
+        with pytest.raises(WriteError, match=r"a\.json: could not be written"):
+            write_text_atomically(path, "x" * 1000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert path.read_text() == "one"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
 def test_text_replaces_text_whole(tmp_path):
     path = tmp_path / "a.json"
     write_text_atomically(path, "one")
