@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 
 from baselines.networks import SegmentationNetwork
 from baselines.s3net import S3Net
-from baselines.unet import UNet, goes_round
+from baselines.unet import UNet
+from semantic2d_dataset.access.transforms import sees_all_around
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.lidars import LidarSpec
 
@@ -14,7 +15,9 @@ _Builder = Callable[[int, int, LidarSpec], SegmentationNetwork]
 
 ARCHITECTURES: Mapping[str, _Builder] = {
     S3Net.name: lambda channels, classes, _: S3Net(channels, classes),
-    UNet.name: lambda channels, classes, lidar: UNet(channels, classes, circular=goes_round(lidar)),
+    UNet.name: lambda channels, classes, lidar: UNet(
+        channels, classes, circular=sees_all_around(lidar)
+    ),
 }
 """Builders by name, from the number of channels, of classes, and the lidar of the scans."""
 

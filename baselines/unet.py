@@ -6,7 +6,6 @@ at each position. The norms are batch norms, which fold into the convolution bef
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import torch
@@ -14,7 +13,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from baselines.networks import Prediction, SegmentationNetwork
-from semantic2d_dataset.scene.lidars import LidarSpec
 
 # Chosen by the validation mIoU on semantic2d-mini at no more multiplications than S3-Net's.
 _STEM = 16  # channels of a beam
@@ -112,12 +110,6 @@ class UNet(SegmentationNetwork):
             nn.Conv2d(_EXPANSION * width, width, 1),
             norm=nn.BatchNorm2d(width),
         )
-
-
-def goes_round(lidar: LidarSpec) -> bool:
-    """Tell whether the last beam of a lidar lies beside its first, or on it."""
-    gap = 2 * math.pi - (lidar.beams - 1) * lidar.angle_increment
-    return gap < 1.5 * lidar.angle_increment
 
 
 class _Residual(nn.Module):

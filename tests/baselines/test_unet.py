@@ -13,7 +13,7 @@ from baselines.configs import TrainingConfig
 from baselines.inference import infer
 from baselines.s3net import S3Net
 from baselines.training import train, validate
-from baselines.unet import UNet, goes_round
+from baselines.unet import UNet
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW, RPLIDAR_S2, WLR_716, LidarSpec
 from tests.baselines.generated import ToyScans, make_scans
@@ -92,7 +92,6 @@ def test_a_pass_takes_no_more_multiplications_than_one_of_s3net():
     [(HOKUYO_UTM_30LX_EW, False), (WLR_716, False), (RPLIDAR_S2, True), (SPINNING, True)],
 )
 def test_only_a_lidar_that_sees_all_around_is_a_ring(lidar: LidarSpec, expected):
-    assert goes_round(lidar) is expected
     assert build_network("unet", 3, 10, lidar).circular is expected
 
 
