@@ -264,8 +264,8 @@ def evaluate(
 
     checkpoint = load_checkpoint(run, device=usable_device(device))
     scans = _scans_for(checkpoint, data, lidar, split, scheme)
+    out.mkdir(parents=True, exist_ok=True)  # before minutes of work
     found = evaluation.evaluate(checkpoint, scans, samples=samples, seed=seed)
-    out.mkdir(parents=True, exist_ok=True)
     evaluation.write_evaluation(found, out)
     typer.echo(found.to_json() if as_json else evaluation.format_evaluation(found), nl=not as_json)
 

@@ -288,6 +288,8 @@ def save(figure: Figure, path: Path, *, dpi: int = 150) -> None:
     ------
     InvalidInputError
         As `check_picture_name` does.
+    WriteError
+        If it cannot be written; what was there stays.
     """
     path = Path(path)
     check_picture_name(path)

@@ -85,7 +85,8 @@ class LidarDataset(Dataset[Batch]):
         as they were measured.
     transform_seed
         Its randomness comes from this seed and the indices of the batch, in their order: it is
-        the same with any number of workers, and differs between epochs that are shuffled.
+        the same with any number of workers, and differs between epochs that are shuffled, but
+        for a scan that is a batch by itself.
 
     Raises
     ------
