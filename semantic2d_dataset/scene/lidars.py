@@ -67,6 +67,7 @@ class LidarSpec:
                 f"lidar {self.name!r}: expected 0 <= range_min < range_max, "
                 f"found {self.range_min} and {self.range_max}"
             )
+        object.__setattr__(self, "base_T_lidar", tuple(self.base_T_lidar))
         if len(self.base_T_lidar) != 6:
             raise InvalidInputError(
                 f"lidar {self.name!r}: base_T_lidar takes x y z roll pitch yaw, "

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
 
+from semantic2d_dataset.access.features import features_of
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.lidars import (
     HOKUYO_UTM_30LX_EW,
@@ -72,3 +75,10 @@ def test_file_that_is_no_lidar_is_refused(text, tmp_path):
     path.write_text(text)
     with pytest.raises(InvalidInputError, match="lidar.yaml"):
         read_lidar(path)
+
+
+def test_a_mount_given_as_a_list_makes_the_same_lidar():
+    spec = replace(SMALL_LIDAR, base_T_lidar=list(SMALL_LIDAR.base_T_lidar))
+    assert spec == SMALL_LIDAR
+    assert hash(spec) == hash(SMALL_LIDAR)
+    assert features_of(np.ones((2, spec.beams), np.float32), None, spec, "RA").shape == (2, 2, 37)
