@@ -21,6 +21,7 @@ import torch
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
+from baselines.architectures import build_network
 from baselines.checkpoints import load_checkpoint
 from baselines.configs import TrainingConfig, changed_settings
 from baselines.detector_scores import score_detector
@@ -29,6 +30,7 @@ from baselines.evaluation import ALL_CLASSES, Evaluation, evaluate
 from baselines.experiments import Experiment, Method, RunSpec
 from baselines.inference import SAMPLES
 from baselines.training import train
+from semantic2d_dataset.access.features import channel_count
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.access.scan_source import ScanSource
 from semantic2d_dataset.access.torch_datasets import load_dataset
@@ -198,6 +200,7 @@ def run_experiment(
         If `folder` cannot be written.
     """
     dataset = describe_dataset(settings)
+    _check_possible(experiment, settings)
     specs = {method: method.runs(settings.lidar, settings.seeds) for method in experiment.methods}
     runs = [
         _Run(spec, settings, dataset, folder / spec.name, jobs)
@@ -232,6 +235,23 @@ def describe_dataset(settings: Settings) -> dict[str, str]:
         "sha256": combined_digest(data.manifest),
         "scheme_sha256": data.manifest.splits[settings.scheme].sha256,
     }
+
+
+def _check_possible(experiment: Experiment, settings: Settings) -> None:
+    """Find what cannot work before hours of training."""
+    data = open_dataset(settings.data)
+    reader = data.reader(data.sequences(settings.lidar)[0].id)
+    lidar, taxonomy = reader.lidar, reader.header.taxonomy
+    for method in experiment.methods:
+        if method.model in DETECTORS:
+            taxonomy.id_of(DETECTORS[method.model].predicts)
+            continue
+        build_network(method.model, channel_count(method.features), len(taxonomy), lidar)
+        if "I" in method.features and "scans/intensities" not in reader:
+            raise InvalidInputError(
+                f"{data.manifest.name}: {lidar.name} gives no intensities, and {experiment.name} "
+                f"needs them for the features {method.features}"
+            )
 
 
 @contextlib.contextmanager

@@ -15,6 +15,8 @@ from baselines.configs import TrainingConfig
 from baselines.experiments import Experiment, Method
 from baselines.reproduction import RunResult, Settings, run_experiment
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.format.manifest import publish
+from tests.generators import SMALL_LIDAR, make_sequence
 
 EXPERIMENT = Experiment(
     "pair", "Two rows", (Method("s3net", "R"), Method("s3net", "RIA", every_seed=False))
@@ -149,6 +151,30 @@ def test_other_settings_are_refused_before_anything_runs(finished, dataset_folde
     with pytest.raises(InvalidInputError, match="another samples"):
         run_experiment(EXPERIMENT, settings_of(dataset_folder, samples=4), folder)
     assert stamps(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "method", "message"),
+    [
+        ({"beams": 20}, Method("unet", "R"), "unet needs at least 33 beams, and own has 20"),
+        ({"intensities": False}, Method("s3net", "RI"), "own gives no intensities, and pair needs"),
+    ],
+)
+def test_what_a_lidar_cannot_give_is_found_before_anything_runs(
+    changes: dict, method: Method, message: str, tmp_path: Path
+):
+    lidar = replace(SMALL_LIDAR, name="own", beams=changes.get("beams", 37))
+    (tmp_path / "data" / "sequences").mkdir(parents=True)
+    drop = () if changes.get("intensities", True) else ("scans/intensities",)
+    for number, place in enumerate(("lobby", "corridor", "office")):
+        path = tmp_path / "data" / "sequences" / f"{place}--first--own.h5"
+        make_sequence(path, 60, lidar=lidar, environment=place, seed=number, drop=drop)
+    publish(tmp_path / "data", name="own", version="1.0.0", license="CC0-1.0")
+    settings = replace(settings_of(tmp_path / "data"), lidar="own")
+    experiment = Experiment("pair", "Two rows", (Method("s3net", "R"), method))
+    with pytest.raises(InvalidInputError, match=message):
+        run_experiment(experiment, settings, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_second_process_in_the_folder_is_refused(dataset_folder: Path, tmp_path: Path):
