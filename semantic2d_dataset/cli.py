@@ -134,6 +134,50 @@ def verify(
 
 
 @app.command()
+def download(
+    dataset: Annotated[str, typer.Argument(metavar="ID[@VERSION]", help="Known data set.")],
+    *,
+    to: Annotated[
+        Path | None, typer.Option(help="Folder; below SEMANTIC2D_HOME or the user's cache if none.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Glob pattern of files to get; all if not given.")
+    ] = None,
+    list_only: Annotated[
+        bool, typer.Option("--list", help="Say what there is and how large, and get nothing.")
+    ] = False,
+    registry: Annotated[
+        Path | None, typer.Option(help="Data sets of your own; SEMANTIC2D_REGISTRY if not given.")
+    ] = None,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Ask no host: check what is there.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Get the files of a published data set as they are, checked.
+
+    Run it again after an interruption: it goes on where it stopped. Raw recordings and processed
+    data are files of their own: look with --list, and choose with --only.
+    """
+    from semantic2d_dataset.access import download as downloads
+    from semantic2d_dataset.access.known_datasets import find_known
+
+    known = find_known(dataset, registry)
+    folder = to or downloads.download_folder(known)
+    if list_only:
+        listed = downloads.find_files(known, folder, only=only or (), offline=offline)
+        said = downloads.describe(known, listed)
+    else:
+        try:
+            got = downloads.download(known, folder, only=only or (), offline=offline)
+        except KeyboardInterrupt:
+            typer.echo("what has arrived is kept; run this again to go on", err=True)
+            raise
+        said = downloads.describe(known, got) | {"folder": str(folder)}
+    typer.echo(json.dumps(said, indent=1) if as_json else downloads.format_description(said))
+
+
+@app.command()
 def simulate(
     out: Annotated[Path, typer.Argument(help="Folder to make.")],
     *,

@@ -12,6 +12,7 @@ import pytest
 
 from semantic2d_dataset import __version__, cli
 from semantic2d_dataset.format.manifest import read_manifest
+from tests.access import hosts
 from tests.conftest import PROJECT
 from tests.generators import make_sequence
 
@@ -43,6 +44,7 @@ def test_help_lists_every_command(run):
     for command in (
         "info",
         "verify",
+        "download",
         "simulate",
         "score",
         "report",
@@ -328,3 +330,76 @@ def test_interrupted_command_says_so_and_exits_with_130(command, tmp_path, datas
     assert "Traceback" not in err
     if command == "own command":
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def own_registry(tmp_path, monkeypatch):
+    """A registry file with one data set, on a host of this machine."""
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.delenv("SEMANTIC2D_OFFLINE", raising=False)
+    host = hosts.Host({"raw.bag": b"raw" * 500, "processed.zip": b"done"})
+    source = {"kind": "zenodo", "record": "7", "host": host.url}
+    entry = {
+        "id": "own",
+        "version": "1",
+        "title": "Own",
+        "license": "CC0",
+        "sources": [source],
+        "doi": "10.1/x",
+    }
+    path = tmp_path / "registry.json"
+    said = {"format": "semantic2d-registry", "format_version": "1.0", "datasets": [entry]}
+    path.write_text(json.dumps(said))
+    yield path
+    host.close()
+
+
+def test_download_lists_and_then_gets_what_is_chosen(own_registry, run, tmp_path):
+    status, out, _ = run("download", "own", "--registry", own_registry, "--list")
+    assert status == 0
+    assert out.splitlines() == [
+        "own@1: Own",
+        "license: CC0",
+        "https://doi.org/10.1/x",
+        "   4.00B  processed.zip",
+        "  1.50kB  raw.bag",
+        "2 file(s), 1.50kB",
+    ]
+    words = ["download", "own@1", "--registry", own_registry, "--to", tmp_path / "out"]
+    status, out, _ = run(*words, "--only", "*.zip")
+    assert status == 0
+    assert out.endswith(f"1 file(s), 4.00B in {tmp_path / 'out'}, checked; 0 had been there\n")
+    assert (tmp_path / "out" / "processed.zip").read_bytes() == b"done"
+    status, out, _ = run(*words, "--only", "*.zip", "--offline", "--json")
+    assert status == 0
+    said = json.loads(out)
+    assert said["files"][0]["name"] == "processed.zip"
+    assert said["files"][0]["fetched"] is False
+
+
+def test_download_goes_to_the_home_of_data_sets(own_registry, run, tmp_path, monkeypatch):
+    monkeypatch.setenv("SEMANTIC2D_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("SEMANTIC2D_REGISTRY", str(own_registry))
+    assert run("download", "own")[0] == 0
+    assert (tmp_path / "home" / "downloads" / "own-1" / "raw.bag").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["semantic2d@9"], "not a known data set; did you mean 'semantic2d@2'?"),
+        (["semantic2d-mini"], "made on this machine"),
+        (["semantic2d", "--offline"], "offline, and its list of files is not here"),
+        (["own", "--only", "*.tar"], "no file fits '*.tar'"),
+        (["own", "--registry", "nowhere.json"], "nowhere.json: no such file"),
+    ],
+)
+def test_download_says_in_one_line_what_is_wrong(
+    words, message, own_registry, run, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("SEMANTIC2D_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("SEMANTIC2D_REGISTRY", str(own_registry))
+    status, out, err = run("download", *words)
+    assert (status, out) == (1, "")
+    assert message in err
+    assert err.count("\n") == 1

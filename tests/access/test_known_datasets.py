@@ -1,4 +1,5 @@
 import json
+import re
 
 import pytest
 
@@ -16,6 +17,7 @@ from semantic2d_dataset.errors import (
     InvalidInputError,
 )
 from semantic2d_dataset.simulation.mini import MINI_NAME, MINI_VERSION
+from tests.conftest import PROJECT
 
 ENTRY = {
     "id": "own",
@@ -120,3 +122,11 @@ def test_other_wrong_registries_are_refused(registry, tmp_path):
         known_datasets(tmp_path / "registry.json")
     with pytest.raises(FileNotFoundError):
         known_datasets(tmp_path / "none.json")
+
+
+def test_example_in_the_docs_can_be_read(tmp_path):
+    text = (PROJECT / "docs" / "download.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "own.json").write_text(example)
+    assert len(find_known("my-building", tmp_path / "own.json").sources) == 3
+    assert all(f"`{each.name}`" in text for each in known_datasets())
