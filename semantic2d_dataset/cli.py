@@ -171,7 +171,9 @@ def download(
         try:
             got = downloads.download(known, folder, only=only or (), offline=offline)
         except KeyboardInterrupt:
-            typer.echo("what has arrived is kept; run this again to go on", err=True)
+            typer.echo(
+                "what has arrived is kept under a hidden name; run this again to go on", err=True
+            )
             raise
         said = downloads.describe(known, got) | {"folder": str(folder)}
     typer.echo(json.dumps(said, indent=1) if as_json else downloads.format_description(said))

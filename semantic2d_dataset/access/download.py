@@ -92,7 +92,7 @@ def find_files(
     only
         Glob patterns over whole names; all files where none is given.
     offline
-        Ask no host; so do `is_offline` settings.
+        Ask no host; nor is one asked where `is_offline`.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def download(
     only
         Glob patterns over whole names; all files where none is given.
     offline
-        Ask no host: check what is there.
+        Ask no host: check what is there; so it is where `is_offline`.
 
     Raises
     ------
@@ -161,7 +161,8 @@ def download(
         missing = [file for file in files if not _is_there(folder, file)]
         folder.mkdir(parents=True, exist_ok=True)
         _check_space(folder, missing)
-        _keep_list(dataset, folder, locations.files)
+        if _read_list(dataset, folder) != locations.files:  # else the folder may be read-only
+            _keep_list(dataset, folder, locations.files)
         for file in missing:
             _fetch_once(session, file, folder, locations)
     return [_local(folder, file, fetched=file in missing) for file in files]

@@ -4,6 +4,7 @@ import email.utils
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import signal
 import time
@@ -248,6 +249,13 @@ def test_what_is_here_needs_no_host(host, tmp_path):
         download(host.dataset(), tmp_path)
 
 
+def test_nothing_is_written_where_all_is_here(host, tmp_path):
+    download(host.dataset(), tmp_path)
+    before = {p.name: p.stat().st_mtime_ns for p in [tmp_path, *tmp_path.iterdir()]}
+    download(host.dataset(), tmp_path)
+    assert {p.name: p.stat().st_mtime_ns for p in [tmp_path, *tmp_path.iterdir()]} == before
+
+
 def test_patterns_choose_files(make_host, tmp_path):
     host = make_host({"raw/a.bag": SMALL, "raw/b.bag": SMALL, "data.zip": BIG})
     download(host.dataset(), tmp_path, only=["raw/*"])
@@ -277,6 +285,19 @@ def test_room_is_looked_for_before_anything_is_fetched(host, tmp_path, monkeypat
     assert host.offsets == []
     leave((1 << 26) + 400_000)
     download(host.dataset(), tmp_path)
+
+
+def test_disk_that_runs_full_is_said_and_the_part_kept(host, tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(WriteError, match=r"big\.zip\..*: file too large"):
+            download(host.dataset(), tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    download(host.dataset(), tmp_path)
+    assert host.offsets == [0, 200_000]
+    assert (tmp_path / "big.zip").read_bytes() == BIG
 
 
 def test_offline_says_what_is_missing_and_where_it_belongs(make_host, tmp_path, monkeypatch):
