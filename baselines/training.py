@@ -331,6 +331,11 @@ def _check_datasets(config: TrainingConfig, *datasets: LabelledScans) -> None:
             f"features {config.features} are {channels} channels, and the data set has "
             f"{len(first.statistics.mean)}; load it with features={config.features!r}"
         )
+    if config.augment and getattr(first, "transform", None) is None:  # few data sets have one
+        raise InvalidInputError(
+            "augment: the training split has no transform; load it with, say, "
+            "transform=default_augmentation(lidar)"
+        )
 
 
 def _save(

@@ -126,13 +126,15 @@ class LidarDataset(Dataset[Batch]):
                 f"{data.manifest.name}: {self.lidar.name} gives no intensities; leave I out of "
                 f"the features {self.features}"
             )
+        self._statistics: Statistics | None = None
         if self.features:
-            self.statistics = statistics or self._train_source().compute_statistics(self.features)
-            if len(self.statistics.mean) != channel_count(self.features):
+            found = statistics or self._train_source().compute_statistics(self.features)
+            if len(found.mean) != channel_count(self.features):
                 raise InvalidInputError(
                     f"features {self.features} have {channel_count(self.features)} channels, the "
-                    f"statistics {len(self.statistics.mean)}"
+                    f"statistics {len(found.mean)}"
                 )
+            self._statistics = found
 
     @classmethod
     def from_path(cls, path: str | Path, **options: Any) -> Self:
@@ -172,6 +174,22 @@ class LidarDataset(Dataset[Batch]):
     def taxonomy(self) -> Taxonomy:
         """The classes that labels refer to."""
         return self.source.taxonomy
+
+    @property
+    def statistics(self) -> Statistics:
+        """What standardises the features.
+
+        Raises
+        ------
+        InvalidInputError
+            If the data set was loaded without features.
+        """
+        if self._statistics is None:
+            raise InvalidInputError(
+                f"{self.source.data.manifest.name}: was loaded without features, which alone are "
+                "standardised; load it with, say, features='RIA'"
+            )
+        return self._statistics
 
     @cached_property
     def class_counts(self) -> NDArray[np.int64]:

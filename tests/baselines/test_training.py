@@ -14,6 +14,7 @@ from baselines.configs import TrainingConfig
 from baselines.s3net import S3Net
 from baselines.steps import momentum_of_micro_batches, step
 from baselines.training import TrainingResult, train, validate
+from semantic2d_dataset import load_dataset
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW
 from tests.baselines.generated import ToyScans, make_scans
@@ -185,6 +186,17 @@ def test_empty_and_unlike_data_sets_are_refused(scans, tmp_path: Path):
         train(CONFIG, scans[0], other, tmp_path)
     with pytest.raises(InvalidInputError, match="features RI are 2 channels"):
         train(replace(CONFIG, features="RI"), *scans, tmp_path)
+
+
+def test_scans_without_features_or_without_the_wanted_augmentation_are_refused(
+    scans, dataset_folder: Path, tmp_path: Path
+):
+    raw = load_dataset(dataset_folder, lidar="small")
+    with pytest.raises(InvalidInputError, match="generated: was loaded without features"):
+        train(CONFIG, raw, raw, tmp_path)
+    with pytest.raises(InvalidInputError, match="augment: the training split has no transform"):
+        train(replace(CONFIG, augment=True), *scans, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_fine_tuning_starts_from_a_copy_of_the_initial_weights(
