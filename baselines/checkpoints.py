@@ -109,7 +109,8 @@ def load_checkpoint(folder: Path, *, device: str | torch.device = "cpu") -> Chec
     said, tensors = read_state(folder, _MODEL)
     path = Path(folder) / f"{_MODEL}.json"
     try:
-        checkpoint = _understand(said)
+        with torch.random.fork_rng([]):  # building a network draws weights
+            checkpoint = _understand(said)
         checkpoint.network.load_state_dict(tensors, strict=True)
     except (KeyError, TypeError, ValueError, AttributeError) as err:
         raise CorruptFileError(f"{path}: not the description of a model: {err!r}") from err

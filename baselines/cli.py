@@ -170,7 +170,7 @@ def predict(
         with_probabilities=probabilities,
         with_samples=all_samples,
     )
-    said = {"predictions": str(out), "scans": count, "samples": samples}
+    said = {"predictions": str(out), "scans": count, "method": checkpoint.network.title}
     text = f"{out}: {count} scans labelled by {checkpoint.network.title}"
     report(said, text, as_json=as_json)
 

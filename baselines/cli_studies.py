@@ -57,7 +57,9 @@ def reproduce(
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for models, tables and pictures.")],
     data: Data = "semantic2d-mini",
-    lidar: Annotated[str, typer.Option(help="Whose scans.")] = "hokuyo",
+    lidar: Annotated[
+        str | None, typer.Option(help="Whose scans; the hokuyo, if not given.")
+    ] = None,
     scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
     preset: Annotated[str, typer.Option(help="Settings of training: quick or paper.")] = "quick",
     epochs: Annotated[int | None, typer.Option(help="Passes over the training split.")] = None,
@@ -77,7 +79,12 @@ def reproduce(
     from baselines.reproduction import Settings, run_experiment
     from baselines.tables import to_text
 
+    trained_with = experiments.parse_seeds(seeds)
     if experiment == experiments.TRANSFER:
+        given = {"--lidar": lidar, "--jobs": jobs > 1, "more than one seed": len(trained_with) > 1}
+        refused = ", ".join(name for name, value in given.items() if value)
+        if refused:
+            raise typer.BadParameter(f"transfer takes every lidar in turn, without {refused}")
         transfer(
             out / "transfer",
             data,
@@ -85,7 +92,7 @@ def reproduce(
             preset=preset,
             epochs=epochs,
             samples=samples,
-            seed=experiments.parse_seeds(seeds)[0],
+            seed=trained_with[0],
             device=device,
             as_json=as_json,
         )
@@ -94,9 +101,9 @@ def reproduce(
     settings = Settings(
         data,
         scheme,
-        lidar,
+        lidar or "hokuyo",
         config_of(preset, epochs=epochs),
-        experiments.parse_seeds(seeds),
+        trained_with,
         samples,
         usable_device(device),
     )

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from baselines.architectures import build_network
@@ -29,6 +28,7 @@ from baselines.detectors import DETECTORS
 from baselines.evaluation import ALL_CLASSES, Evaluation, evaluate
 from baselines.experiments import Experiment, Method, RunSpec
 from baselines.inference import SAMPLES
+from baselines.locks import alone_in
 from baselines.training import train
 from semantic2d_dataset.access.features import channel_count
 from semantic2d_dataset.access.registry import open_dataset
@@ -157,7 +157,12 @@ class _Run:
     def task(self) -> dict[str, Any]:
         """All that its result depends on, as plain values."""
         config = asdict(self.settings.config_of(self.spec)) if self.spec.features else {}
-        said = {"lidar": self.spec.lidar, **self.dataset, "samples": self.settings.samples}
+        said = {
+            "lidar": self.spec.lidar,
+            **self.dataset,
+            "samples": self.settings.samples,
+            "device": torch.device(self.settings.device).type,
+        }
         return dict(json.loads(json.dumps(said | config)))
 
     @property
@@ -207,7 +212,7 @@ def run_experiment(
         for of_method in specs.values()
         for spec in of_method
     ]
-    with _alone_in(folder):
+    with alone_in(folder):
         for run in runs:
             _check_task(run)
         waiting = [run for run in runs if not run.is_done]
@@ -254,19 +259,6 @@ def _check_possible(experiment: Experiment, settings: Settings) -> None:
             )
 
 
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep a second process from training the same models."""
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(folder / ".lock", timeout=0):
-            yield
-    except Timeout as err:
-        raise InvalidInputError(
-            f"{folder}: another process works here; wait for it, or choose another folder"
-        ) from err
-
-
 def _check_task(run: _Run) -> None:
     """Raise InvalidInputError if the run that is there is another one."""
     path = run.folder / _TASK
@@ -276,7 +268,7 @@ def _check_task(run: _Run) -> None:
         before = dict(load_json(path.read_bytes()))
     except (ValueError, TypeError) as err:
         raise CorruptFileError(f"{path}: damaged; delete {run.folder} to run again") from err
-    changed = changed_settings(run.task, before)
+    changed = changed_settings(run.task, {"device": "cpu"} | before)
     if changed:
         key = changed[0]
         raise InvalidInputError(

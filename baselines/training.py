@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
 import time
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -27,6 +29,7 @@ from baselines.checkpoints import (
     write_state,
 )
 from baselines.configs import TrainingConfig, changed_settings, learning_rate_at
+from baselines.locks import alone_in
 from baselines.losses import median_frequency_weights
 from baselines.networks import SegmentationNetwork
 from baselines.steps import freeze_norms, keep_freed_memory, momentum_of_micro_batches, step
@@ -150,9 +153,7 @@ def train(
     _check_datasets(config, train_dataset, val_dataset)
     where = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     keep_freed_memory()
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    forked = [torch.cuda.current_device()] if where.type == "cuda" else []
-    with join_team(where) as team, torch.random.fork_rng(forked):
+    with join_team(where) as team, _as_writer(team, Path(folder)), _own_random_state(where):
         _check_team(team, config, len(train_dataset))
         run = _start(config, train_dataset, where, initial, team)
         if resume and has_state(folder, _RESUME):
@@ -173,6 +174,19 @@ def train(
     return TrainingResult(
         Path(folder), int(best["epoch"]), best["val_miou"], len(run.log), run.seconds
     )
+
+
+def _as_writer(team: Team, folder: Path) -> AbstractContextManager[None]:
+    """Let the first process of a team, which alone writes, be alone in the folder."""
+    return alone_in(folder) if team.rank == 0 else contextlib.nullcontext()
+
+
+def _own_random_state(device: torch.device) -> AbstractContextManager[None]:
+    """Leave torch's random state, on the CPU and the device, as it was found."""
+    if device.type != "cuda":
+        return torch.random.fork_rng([])
+    here = torch.cuda.current_device() if device.index is None else device.index
+    return torch.random.fork_rng([here])
 
 
 def validate(
@@ -351,7 +365,12 @@ def _save(
         parts = (config.features, dataset.statistics, dataset.lidar, dataset.taxonomy)
         training = asdict(config) | {"reached": reached}
         save_checkpoint(folder, Checkpoint(run.network, *parts, about, training))
-    said = {"config": asdict(config), "log": run.log, "statistics": asdict(dataset.statistics)}
+    said = {
+        "config": asdict(config),
+        "log": run.log,
+        "statistics": asdict(dataset.statistics),
+        "scans": _describe_scans(dataset),
+    }
     moments = run.optimiser.state_dict()["state"]
     tensors = {f"network/{key}": value for key, value in run.network.state_dict().items()}
     tensors |= {
@@ -368,9 +387,11 @@ def _save(
 def _restore(run: _Run, config: TrainingConfig, dataset: LabelledScans, folder: Path) -> None:
     """Put a run where `_save` left it."""
     said, tensors = read_state(folder, _RESUME)
-    now = json.loads(json.dumps(asdict(config) | {"statistics": asdict(dataset.statistics)}))
+    scans = _describe_scans(dataset)
+    now = asdict(config) | {"statistics": asdict(dataset.statistics)} | scans
+    now = json.loads(json.dumps(now))
     try:
-        before = said["config"] | {"statistics": said["statistics"]}
+        before = said["config"] | {"statistics": said["statistics"]} | said.get("scans", scans)
         changed = changed_settings(now, before)
         log, seconds = list(said["log"]), float(said["log"][-1]["seconds"])
     except (KeyError, TypeError, IndexError, ValueError) as err:
@@ -393,6 +414,15 @@ def _restore(run: _Run, config: TrainingConfig, dataset: LabelledScans, folder: 
     run.network.load_state_dict(weights)
     run.optimiser.load_state_dict(state)
     run.log, run.seconds = log, seconds
+
+
+def _describe_scans(dataset: LabelledScans) -> dict[str, Any]:
+    """Tell the scans of a training from others."""
+    return {
+        "lidar": dataset.lidar.name,
+        "class names": list(dataset.taxonomy.names),
+        "class counts": np.asarray(dataset.class_counts).tolist(),
+    }
 
 
 def _progress_bar(team: Team) -> tqdm[Any]:

@@ -185,7 +185,7 @@ def plot_reliability(calibration: Mapping[str, Any]) -> Figure:
         fontsize=10,
     )
     reliability[0].set_ylabel("Accuracy (%)")
-    reliability[1].set_xlabel("Confidence of the label")
+    reliability[1].set_xlabel("Confidence")
     reliability[1].set_ylabel("Points (%)")
     _draw_bins(errors, calibration["entropy_bins"], "error")
     errors[0].set_title(

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from baselines import reproduction
 from baselines.configs import TrainingConfig
 from baselines.experiments import Experiment, Method
+from baselines.locks import alone_in
 from baselines.reproduction import RunResult, Settings, run_experiment
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
 from semantic2d_dataset.format.manifest import publish
@@ -180,7 +180,7 @@ def test_what_a_lidar_cannot_give_is_found_before_anything_runs(
 def test_a_second_process_in_the_folder_is_refused(dataset_folder: Path, tmp_path: Path):
     settings = settings_of(dataset_folder)
     with (
-        reproduction._alone_in(tmp_path),
+        alone_in(tmp_path),
         pytest.raises(InvalidInputError, match="another process works here"),
     ):
         run_experiment(EXPERIMENT, settings, tmp_path)

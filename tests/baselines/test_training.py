@@ -11,6 +11,7 @@ import torch
 
 from baselines.checkpoints import load_checkpoint
 from baselines.configs import TrainingConfig
+from baselines.locks import alone_in
 from baselines.s3net import S3Net
 from baselines.steps import momentum_of_micro_batches, step
 from baselines.training import TrainingResult, train, validate
@@ -85,7 +86,7 @@ def test_an_interrupted_training_keeps_its_epochs_and_resumes_to_the_same_end(
     assert len(log_of(tmp_path)) == 2
     load_checkpoint(tmp_path)
     names = {path.name.partition("-")[0] for path in tmp_path.iterdir()}
-    assert names == {"log.csv", "model", "model.json", "resume", "resume.json"}
+    assert names == {"log.csv", "model", "model.json", "resume", "resume.json", ".lock"}
     resumed = train(CONFIG, *scans, tmp_path, resume=True)
     assert resumed.epochs == 12
     assert same(weights_of(tmp_path), weights_of(trained.folder))
@@ -94,12 +95,12 @@ def test_an_interrupted_training_keeps_its_epochs_and_resumes_to_the_same_end(
         assert one | drop == other | drop
 
 
-def test_an_interruption_in_the_first_epoch_leaves_no_file(scans, tmp_path: Path):
+def test_an_interruption_in_the_first_epoch_leaves_no_model(scans, tmp_path: Path):
     interrupted = ToyScans(64)
     interrupted.batches_until_interrupt = 3
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, interrupted, scans[1], tmp_path)
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]  # which is empty
 
 
 def test_a_finished_training_is_not_trained_further(scans, trained: TrainingResult):
@@ -216,3 +217,20 @@ def test_fine_tuning_starts_from_a_copy_of_the_initial_weights(
         fewer = ToyScans(8)
         fewer.statistics = type(fewer.statistics)((0.0, 0.0), (1.0, 1.0))
         train(replace(CONFIG, features="RI"), fewer, fewer, tmp_path / "other", initial=initial)
+
+
+def test_a_training_is_not_resumed_on_scans_that_were_labelled_anew(scans, tmp_path: Path):
+    train(replace(CONFIG, epochs=1), *scans, tmp_path)
+    relabelled = ToyScans(64)
+    relabelled.labels[relabelled.labels == 1] = 2
+    with pytest.raises(InvalidInputError, match="other settings were used for class counts"):
+        train(replace(CONFIG, epochs=1), relabelled, scans[1], tmp_path, resume=True)
+
+
+def test_two_trainings_do_not_share_a_folder(scans, tmp_path: Path):
+    with (
+        alone_in(tmp_path),
+        pytest.raises(InvalidInputError, match="another process works here"),
+    ):
+        train(CONFIG, *scans, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [".lock"]
