@@ -43,11 +43,12 @@ def step(
         Weights of the three terms.
     micro_batch
         Scans that go through the network at a time, their gradients averaged; None takes all.
-        Batch norms and Lovasz-softmax see one micro-batch each. For a batch of 1,024 Hokuyo scans
-        in parts of 32, the loss stayed within 0.6 % and the gradient within 2.9 %, where merely
-        drawing other latents changes it by 2.0 %.
+        Batch norms and Lovasz-softmax see one micro-batch each. For a batch of 1,024 Hokuyo scans,
+        loss and gradient changed by 0.6 and 2.9 % in parts of 32, and by 0.1 and 1.5 % in parts of
+        128, where merely drawing other latents changes the gradient by 2.0 %.
     bf16
-        Let convolutions compute with 16 bits; weights, losses and sums keep 32.
+        Let convolutions compute with 16 bits; weights, losses and sums keep 32. In the same batch,
+        loss and gradient changed by 0.01 and 1.1 %.
     """
     scans = len(batch["features"])
     sums: dict[str, float] = {}
