@@ -154,11 +154,13 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
 def format_evaluation(evaluation: Evaluation) -> str:
     """Lay an evaluation out as text: by class, then how sure and how fast."""
     rows, majority = evaluation.rows, evaluation.majority
+    several = evaluation.samples > 1
+    spread = _spread if several else _mean
     names = list(rows["CA"])
     width = max(map(len, names))
     header = f"{'':{width}}  {'CA':>14} {'IoU':>14}   {'vote: CA':>8} {'IoU':>6}"
     lines = [
-        f"{name:{width}}  {_spread(rows['CA'][name]):>14} {_spread(rows['IoU'][name]):>14}   "
+        f"{name:{width}}  {spread(rows['CA'][name]):>14} {spread(rows['IoU'][name]):>14}   "
         f"{percent(_voted(majority, name, 'CA')):>8} {percent(_voted(majority, name, 'IoU')):>6}"
         for name in names
     ]
@@ -171,6 +173,8 @@ def format_evaluation(evaluation: Evaluation) -> str:
     about = (
         f"In percent: mean and standard deviation over {evaluation.samples} samples of every scan, "
         "and the label that most of them chose."
+        if several
+        else "In percent: one sample of every scan."
     )
     errors = (
         f"Calibration error: expected {percent(sure['ece'])} %, largest {percent(sure['mce'])} %. "
@@ -181,8 +185,8 @@ def format_evaluation(evaluation: Evaluation) -> str:
         f"{_nats(information['right'])}, where wrong {_nats(information['wrong'])}."
     )
     rate = (
-        f"Scans a second: {speed['one_pass']:.0f} by one pass, {speed['sampled']:.1f} with "
-        f"{evaluation.samples} samples ({speed['processor']}; {speed['how']})."
+        f"Scans a second: {speed['one_pass']:.0f} by one pass, {speed['sampled']:.1f} with all "
+        f"samples and their entropy ({speed['processor']}; {speed['how']})."
     )
     return "\n".join((title, "", header, *lines, "", about, errors, disagreement, rate))
 
@@ -256,6 +260,10 @@ def _voted(majority: Mapping[str, Any], name: str, metric: str) -> float | None:
 
 def _spread(figures: Spread | None) -> str:
     return "-" if figures is None else f"{percent(figures[0])} ± {percent(figures[1])}"
+
+
+def _mean(figures: Spread | None) -> str:
+    return "-" if figures is None else percent(figures[0])
 
 
 def _wrong(calibration: Mapping[str, Any]) -> str:
