@@ -3,71 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
-import json
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from baselines.architectures import build_network
-from baselines.checkpoints import (
-    Checkpoint,
-    has_state,
-    read_state,
-    save_checkpoint,
-    write_state,
-)
-from baselines.configs import TrainingConfig, changed_settings, learning_rate_at
+from baselines.configs import TrainingConfig, learning_rate_at
+from baselines.labelled_scans import LabelledScans, check_scans
 from baselines.locks import alone_in
 from baselines.losses import median_frequency_weights
 from baselines.networks import SegmentationNetwork
 from baselines.steps import freeze_norms, keep_freed_memory, momentum_of_micro_batches, step
 from baselines.team import Team, join_team
-from semantic2d_dataset.access.features import Statistics, channel_count
-from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
-from semantic2d_dataset.format.writing import write_text_atomically
-from semantic2d_dataset.scene.lidars import LidarSpec
-from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
+from baselines.training_runs import TrainingRun, can_resume, restore_run, save_run
+from semantic2d_dataset.access.features import channel_count
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.taxonomy import UNLABELLED
 from semantic2d_dataset.scoring.metrics import Evaluator
-
-_RESUME = "resume"
-_LOG_NAME = "log.csv"
-
-
-class LabelledScans(Protocol):
-    """What training needs of a data set; `semantic2d_dataset.load_dataset` returns one."""
-
-    @property
-    def lidar(self) -> LidarSpec:
-        """The sensor of all scans."""
-
-    @property
-    def taxonomy(self) -> Taxonomy:
-        """The K classes of the labels."""
-
-    @property
-    def class_counts(self) -> NDArray[np.int64]:
-        """Labelled beams with a return of each class, (K,) i8."""
-
-    @property
-    def statistics(self) -> Statistics:
-        """What standardised the features."""
-
-    def __len__(self) -> int: ...
-
-    def loader(self, batch_size: int, *, shuffle: bool, seed: int) -> DataLoader[dict[str, Any]]:
-        """Batches with ``features`` (N, C, B) f4, ``label`` (N, B) i8, ``valid`` (N, B) bool."""
 
 
 @dataclass(frozen=True)
@@ -82,27 +42,6 @@ class TrainingResult:
     best_miou: float
     epochs: int
     seconds: float
-
-
-@dataclass
-class _Run:
-    """What changes while training."""
-
-    network: SegmentationNetwork
-    optimiser: torch.optim.Adam
-    class_weights: Tensor
-    team: Team
-    log: list[dict[str, float]] = field(default_factory=list)
-    seconds: float = 0.0
-
-    @property
-    def device(self) -> torch.device:
-        return self.class_weights.device
-
-    @property
-    def best(self) -> dict[str, float]:
-        """The row of the epoch that validates best, the earliest of equals."""
-        return max(self.log, key=lambda row: row["val_miou"])
 
 
 def train(
@@ -150,14 +89,14 @@ def train(
     WriteError
         If `folder` cannot be written.
     """
-    _check_datasets(config, train_dataset, val_dataset)
+    check_scans(config, train_dataset, val_dataset)
     where = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     keep_freed_memory()
     with join_team(where) as team, _as_writer(team, Path(folder)), _own_random_state(where):
         _check_team(team, config, len(train_dataset))
         run = _start(config, train_dataset, where, initial, team)
-        if resume and has_state(folder, _RESUME):
-            _restore(run, config, train_dataset, Path(folder))
+        if resume and can_resume(Path(folder)):
+            restore_run(run, config, train_dataset, Path(folder))
         clock = _Clock(config, run.seconds)
         network = team.wrap(run.network)
         with _progress_bar(team) as bar:
@@ -168,7 +107,7 @@ def train(
                 run.seconds = row["seconds"] = clock.elapsed
                 run.log.append(row)
                 if team.rank == 0:
-                    _save(run, config, train_dataset, Path(folder), about or {})
+                    save_run(run, config, train_dataset, Path(folder), about or {})
                 bar.set_postfix(mIoU=f"{row['val_miou']:.3f}", loss=f"{row['loss']:.1f}")
     best = run.best
     return TrainingResult(
@@ -236,7 +175,7 @@ def _start(
     device: torch.device,
     initial: SegmentationNetwork | None,
     team: Team,
-) -> _Run:
+) -> TrainingRun:
     torch.manual_seed(config.seed)
     channels, classes = channel_count(config.features), len(dataset.taxonomy)
     network = build_network(config.model, channels, classes, dataset.lidar).to(device)
@@ -247,7 +186,7 @@ def _start(
         network.parameters(), config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
     weights = median_frequency_weights(dataset.class_counts) ** config.class_weight_power
-    return _Run(network, optimiser, weights.to(device), team)
+    return TrainingRun(network, optimiser, weights.to(device), team)
 
 
 def _copy_weights(initial: SegmentationNetwork, network: SegmentationNetwork) -> None:
@@ -262,7 +201,7 @@ def _copy_weights(initial: SegmentationNetwork, network: SegmentationNetwork) ->
 
 
 def _train_epoch(
-    run: _Run,
+    run: TrainingRun,
     network: nn.Module,
     dataset: LabelledScans,
     config: TrainingConfig,
@@ -328,101 +267,6 @@ def _check_team(team: Team, config: TrainingConfig, scans: int) -> None:
         raise InvalidInputError(
             f"{team.size} processes cannot keep one time limit; say how many epochs instead"
         )
-
-
-def _check_datasets(config: TrainingConfig, *datasets: LabelledScans) -> None:
-    first = datasets[0]
-    for dataset in datasets:
-        if len(dataset) == 0:
-            raise InvalidInputError("training needs at least one scan in train and val each")
-        if (dataset.lidar, dataset.taxonomy) != (first.lidar, first.taxonomy):
-            raise InvalidInputError("train and val are of different lidars or classes")
-        if dataset.statistics != first.statistics:
-            raise InvalidInputError("val must be standardised by the statistics of train")
-    channels = channel_count(config.features)
-    if len(first.statistics.mean) != channels:
-        raise InvalidInputError(
-            f"features {config.features} are {channels} channels, and the data set has "
-            f"{len(first.statistics.mean)}; load it with features={config.features!r}"
-        )
-    if config.augment and getattr(first, "transform", None) is None:  # few data sets have one
-        raise InvalidInputError(
-            "augment: the training split has no transform; load it with, say, "
-            "transform=default_augmentation(lidar)"
-        )
-
-
-def _save(
-    run: _Run,
-    config: TrainingConfig,
-    dataset: LabelledScans,
-    folder: Path,
-    about: Mapping[str, str],
-) -> None:
-    """Leave the files of a finished epoch; the log comes last, when the rest is there."""
-    if run.best is run.log[-1]:
-        reached = {key: run.log[-1][key] for key in ("epoch", "val_miou", "seconds")}
-        parts = (config.features, dataset.statistics, dataset.lidar, dataset.taxonomy)
-        training = asdict(config) | {"reached": reached}
-        save_checkpoint(folder, Checkpoint(run.network, *parts, about, training))
-    said = {
-        "config": asdict(config),
-        "log": run.log,
-        "statistics": asdict(dataset.statistics),
-        "scans": _describe_scans(dataset),
-    }
-    moments = run.optimiser.state_dict()["state"]
-    tensors = {f"network/{key}": value for key, value in run.network.state_dict().items()}
-    tensors |= {
-        f"optimiser/{i}/{key}": value for i, m in moments.items() for key, value in m.items()
-    }
-    write_state(folder, _RESUME, said, tensors)
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(run.log[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(run.log)
-    write_text_atomically(folder / _LOG_NAME, table.getvalue())
-
-
-def _restore(run: _Run, config: TrainingConfig, dataset: LabelledScans, folder: Path) -> None:
-    """Put a run where `_save` left it."""
-    said, tensors = read_state(folder, _RESUME)
-    scans = _describe_scans(dataset)
-    now = asdict(config) | {"statistics": asdict(dataset.statistics)} | scans
-    now = json.loads(json.dumps(now))
-    try:
-        before = said["config"] | {"statistics": said["statistics"]} | said.get("scans", scans)
-        changed = changed_settings(now, before)
-        log, seconds = list(said["log"]), float(said["log"][-1]["seconds"])
-    except (KeyError, TypeError, IndexError, ValueError) as err:
-        raise CorruptFileError(f"{folder}: the state to resume from is damaged: {err!r}") from err
-    if changed:
-        raise InvalidInputError(
-            f"{folder}: cannot resume, because other settings were used for "
-            f"{', '.join(changed)}; use the same, or another folder"
-        )
-    state = run.optimiser.state_dict()
-    for name, value in tensors.items():
-        kind, *rest = name.split("/")
-        if kind == "optimiser":
-            state["state"].setdefault(int(rest[0]), {})[rest[1]] = value
-    weights = {
-        name.removeprefix("network/"): value
-        for name, value in tensors.items()
-        if name.startswith("network/")
-    }
-    run.network.load_state_dict(weights)
-    run.optimiser.load_state_dict(state)
-    run.log, run.seconds = log, seconds
-
-
-def _describe_scans(dataset: LabelledScans) -> dict[str, Any]:
-    """Tell the scans of a training from others."""
-    return {
-        "lidar": dataset.lidar.name,
-        "class names": list(dataset.taxonomy.names),
-        "class counts": np.asarray(dataset.class_counts).tolist(),
-    }
 
 
 def _progress_bar(team: Team) -> tqdm[Any]:
