@@ -19,6 +19,13 @@ def md5(body):
     return f"md5:{hashlib.md5(body).hexdigest()}"
 
 
+class _Server(ThreadingHTTPServer):
+    """Says nothing of clients that went away: some tests kill them."""
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        pass
+
+
 class Host:
     """Serves files as a record lists them.
 
@@ -34,7 +41,7 @@ class Host:
         self.list_moods = []
         self.requests = []
         self.pages = {}
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
+        self._server = _Server(("127.0.0.1", 0), self._handler())
         self._server.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._server.server_port}"
         threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True).start()
