@@ -50,6 +50,8 @@ def label(
 
     from baselines.labelling import label_sequence
 
+    if device is not None and model.is_file():
+        raise InvalidInputError(f"{model}: an ONNX file runs on the CPU; leave --device out")
     summary = label_sequence(
         sequence,
         model,

@@ -154,6 +154,8 @@ def test_a_model_goes_to_a_robot_and_labels_a_recording(
         with pytest.raises(InvalidInputError, match="exists already"):
             run(*words)
         assert "points labelled: Other" in run(*words, "--force")
+    with pytest.raises(InvalidInputError, match="an ONNX file runs on the CPU"):
+        run(*words, "--force", "--device", "cuda")
 
 
 def test_export_says_what_it_needs(model: Path, tmp_path: Path):
