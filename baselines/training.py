@@ -23,7 +23,13 @@ from baselines.losses import median_frequency_weights
 from baselines.networks import SegmentationNetwork
 from baselines.steps import freeze_norms, keep_freed_memory, momentum_of_micro_batches, step
 from baselines.team import Team, join_team
-from baselines.training_runs import TrainingRun, can_resume, restore_run, save_run
+from baselines.training_runs import (
+    TrainingRun,
+    can_resume,
+    discard_run,
+    restore_run,
+    save_run,
+)
 from semantic2d_dataset.access.features import channel_count
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
@@ -97,6 +103,8 @@ def train(
         run = _start(config, train_dataset, where, initial, team)
         if resume and can_resume(Path(folder)):
             restore_run(run, config, train_dataset, Path(folder))
+        elif team.rank == 0:
+            discard_run(Path(folder))
         clock = _Clock(config, run.seconds)
         network = team.wrap(run.network)
         with _progress_bar(team) as bar:

@@ -51,6 +51,13 @@ def can_resume(folder: Path) -> bool:
     return has_state(folder, _RESUME)
 
 
+def discard_run(folder: Path) -> None:
+    """Delete the state that an earlier training left, so that a new one is never taken for it."""
+    (folder / f"{_RESUME}.json").unlink(missing_ok=True)
+    for weights in folder.glob(f"{_RESUME}-*.safetensors"):
+        weights.unlink(missing_ok=True)
+
+
 def save_run(
     run: TrainingRun,
     config: TrainingConfig,

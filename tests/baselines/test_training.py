@@ -234,3 +234,13 @@ def test_two_trainings_do_not_share_a_folder(scans, tmp_path: Path):
     ):
         train(CONFIG, *scans, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+
+
+def test_a_new_training_is_never_taken_for_the_one_that_it_replaces(scans, tmp_path: Path):
+    train(replace(CONFIG, epochs=2), *scans, tmp_path)
+    interrupted = ToyScans(64)
+    interrupted.batches_until_interrupt = 3
+    with pytest.raises(KeyboardInterrupt):
+        train(replace(CONFIG, epochs=2), interrupted, scans[1], tmp_path)
+    load_checkpoint(tmp_path)  # the old model, until the new one has an epoch
+    assert not list(tmp_path.glob("resume*"))
