@@ -21,6 +21,7 @@ import torch
 from tqdm import tqdm
 
 from baselines import inference
+from baselines.architectures import build_network
 from baselines.checkpoints import load_checkpoint
 from baselines.configs import TrainingConfig
 from baselines.networks import SegmentationNetwork
@@ -203,6 +204,7 @@ def _check(study: TransferStudy) -> None:
                 statistics=statistics,
                 in_memory=False,
             )
+        build_network(study.config.model, channels, len(scans.taxonomy), scans.lidar)
         if lidar == study.lidars[0]:
             taxonomy = scans.taxonomy
         if scans.taxonomy != taxonomy:

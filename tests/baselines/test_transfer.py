@@ -169,3 +169,14 @@ def test_what_cannot_be_studied_is_one_clear_error_and_no_file(
     with pytest.raises((InvalidInputError, DatasetNotFoundError), match=message):
         run("transfer", "--out", out, *usual, *words)
     assert not out.exists()
+
+
+def test_a_lidar_too_small_for_the_model_is_found_before_any_training(tmp_path: Path):
+    few = LidarSpec("few", "Few", 21, -1.0, 0.1, 0.1, 20.0)
+    make_dataset(tmp_path / "data", environments=("lobby",), lidars=(SMALL_LIDAR, few), scans=50)
+    data = open_dataset(tmp_path / "data")
+    config = replace(CONFIG, model="unet")
+    study = TransferStudy(data, lidars_of(data), config, fine_tuning_of(config))
+    with pytest.raises(InvalidInputError, match="unet needs at least 33 beams, and few has 21"):
+        measure_transfer(study, tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
