@@ -24,7 +24,13 @@ ROOMS = (
     "summaries",
     "reports",
     "viewing",
+    "publishing",
     "pipeline",
+    "loading",
+    "cli_options",
+    "cli_data",
+    "cli_publishing",
+    "cli_splits",
     "cli",
 )
 FILES = [p for package in PACKAGES for p in sorted((PROJECT / package).rglob("*.py"))]
