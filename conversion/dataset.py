@@ -11,7 +11,8 @@ from conversion.plan import SequencePlan
 from semantic2d_dataset.errors import WriteError
 from semantic2d_dataset.format.manifest import publish
 from semantic2d_dataset.format.sequence import SequenceReader, slug
-from semantic2d_dataset.format.splits import NONE, SplitScheme, read_scheme, schemes_of
+from semantic2d_dataset.format.split_schemes import schemes_of
+from semantic2d_dataset.format.splits import NONE, SplitScheme, read_scheme
 from semantic2d_dataset.format.writing import write_bytes_atomically
 
 FRAME = "frame"

@@ -15,7 +15,6 @@ from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.container import kind_of
 from semantic2d_dataset.format.schema import CHUNK_ROWS, PREDICTIONS
 from semantic2d_dataset.format.sequence import SequenceReader
-from semantic2d_dataset.format.splits import NONE, TEST, TRAIN, VAL, SplitScheme
 from semantic2d_dataset.scene.geometry import Pose2, to_base, to_points, transform
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.maps import SemanticMap
@@ -154,14 +153,8 @@ def describe_dataset(data: OpenDataset) -> Summary:
         "sequences": len(manifest.sequences),
         "environments": sorted({entry.environment for entry in manifest.sequences}),
         "scans_by_lidar": dict(sorted(lidars.items())),
-        "splits": {name: _split_sizes(data.scheme(name)) for name in sorted(manifest.splits)},
+        "splits": {name: data.scheme(name).sizes for name in sorted(manifest.splits)},
     }
-
-
-def _split_sizes(scheme: SplitScheme) -> dict[str, int]:
-    ids = {"train": TRAIN, "val": VAL, "test": TEST, "none": NONE}
-    members = np.concatenate([np.zeros(0, np.uint8), *scheme.membership.values()])
-    return {name: int((members == i).sum()) for name, i in ids.items()}
 
 
 def format_summary(said: Summary) -> str:

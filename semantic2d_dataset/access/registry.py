@@ -25,7 +25,7 @@ from semantic2d_dataset.format.manifest import (
 from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.format.splits import SplitScheme, read_scheme
 from semantic2d_dataset.format.writing import make_folder
-from semantic2d_dataset.scene.lidars import find_lidar
+from semantic2d_dataset.scene.lidars import full_name
 
 HOME_VARIABLE = "SEMANTIC2D_HOME"
 MINI = "semantic2d-mini"
@@ -54,7 +54,7 @@ class OpenDataset:
         names = sorted({entry.lidar for entry in self.manifest.sequences})
         if lidar is None:
             return list(self.manifest.sequences)
-        name = lidar if lidar in names else _release_name(lidar)
+        name = lidar if lidar in names else full_name(lidar)
         found = [entry for entry in self.manifest.sequences if entry.lidar == name]
         if not found:
             raise DatasetNotFoundError(
@@ -105,13 +105,6 @@ class OpenDataset:
         reader = SequenceReader(path)
         check_sequence(reader, entry)
         return reader
-
-
-def _release_name(lidar: str) -> str:
-    try:
-        return find_lidar(lidar).name
-    except InvalidInputError:
-        return lidar
 
 
 def home() -> Path:

@@ -27,7 +27,8 @@ from semantic2d_dataset.errors import (
 from semantic2d_dataset.format.container import check_version, load_json
 from semantic2d_dataset.format.schema import FORMAT_VERSION
 from semantic2d_dataset.format.sequence import SequenceReader, slug
-from semantic2d_dataset.format.splits import SplitScheme, read_scheme, schemes_of, write_scheme
+from semantic2d_dataset.format.split_schemes import schemes_of
+from semantic2d_dataset.format.splits import SplitScheme, read_scheme, write_scheme
 from semantic2d_dataset.format.writing import write_text_atomically
 
 MANIFEST_NAME = "dataset.json"

@@ -18,14 +18,14 @@ from semantic2d_dataset.format.manifest import (
     read_manifest,
 )
 from semantic2d_dataset.format.sequence import SequenceReader
-from semantic2d_dataset.format.splits import (
-    SplitScheme,
+from semantic2d_dataset.format.split_schemes import (
     make_block_scheme,
     make_environment_scheme,
     make_frame_scheme,
-    read_scheme,
+    make_lidar_scheme,
     schemes_of,
 )
+from semantic2d_dataset.format.splits import SplitScheme, read_scheme
 from semantic2d_dataset.pipeline.config import Config
 from semantic2d_dataset.pipeline.drops import without
 
@@ -85,6 +85,8 @@ def _schemes(config: Config, stamps_ns: Mapping[str, NDArray[np.int64]]) -> Sequ
             schemes.append(make_block_scheme(stamps_ns, **said))
         elif name == "frame":
             schemes.append(make_frame_scheme(lengths, **{"seed": 0, **said}))
+        elif name == "lidar":
+            schemes.append(make_lidar_scheme(stamps_ns, **said))
         else:
             schemes.append(make_environment_scheme(lengths, **said))
     return schemes

@@ -146,6 +146,14 @@ def find_lidar(name: str) -> LidarSpec:
     return spec
 
 
+def full_name(name: str) -> str:
+    """Return the id of a lidar of the release for its short name; any other name as it is."""
+    try:
+        return find_lidar(name).name
+    except InvalidInputError:
+        return name
+
+
 def read_lidar(path: Path) -> LidarSpec:
     """Read a lidar from a YAML file whose keys are the fields of `LidarSpec`.
 

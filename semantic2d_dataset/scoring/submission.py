@@ -268,8 +268,12 @@ def _identity_problems(
         ("scheme", scheme, said.scheme, scheme in (None, said.scheme)),
         ("split", split, said.split, split is None or _canonical(split) == _canonical(said.split)),
     )
+    advice = {
+        "dataset_version": "; a new MAJOR or MINOR has other scans or splits: score against the "
+        "version that was predicted (--data FOLDER), or predict again"
+    }
     return [
-        f"{name}: expected {want!r}, the file says {found!r}"
+        f"{name}: expected {want!r}, the file says {found!r}{advice.get(name, '')}"
         for name, want, found, same in expected
         if found and not same
     ]

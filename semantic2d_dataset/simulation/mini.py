@@ -29,7 +29,7 @@ from semantic2d_dataset.simulation.recording import EPOCH_NS, Scene, record_bloc
 from semantic2d_dataset.simulation.worlds import check_plan, draw_world
 
 MINI_NAME = "semantic2d-mini"
-MINI_VERSION = "1.0.0"
+MINI_VERSION = "1.1.0"
 MINI_SEED = 2024
 MINI_DIGEST = "c7c05ab3de70a6754f29ec4e641b22094b3d0bbfb2c10ac46d3e21aad7a4cc98"
 _LICENSE = "MIT"

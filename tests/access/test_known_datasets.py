@@ -56,7 +56,7 @@ def test_published_data_sets_are_known_with_their_hosts():
         "semantic2d@2",
         "semantic2d@1",
         "ogm-turtlebot2@1",
-        "semantic2d-mini@1.0.0",
+        "semantic2d-mini@1.1.0",
     ]
     newest = find_known("semantic2d")
     assert newest.name == "semantic2d@2"

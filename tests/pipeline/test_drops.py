@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.format.splits import make_frame_scheme
+from semantic2d_dataset.format.split_schemes import make_frame_scheme
 from semantic2d_dataset.pipeline.drops import read_drops, without
 
 ONE = {"lab--a--hokuyo": 100}

@@ -12,7 +12,7 @@ import pytest
 
 from semantic2d_dataset.errors import ChecksumError, InvalidInputError
 from semantic2d_dataset.format.sequence import SequenceReader
-from semantic2d_dataset.format.splits import make_block_scheme
+from semantic2d_dataset.format.split_schemes import make_block_scheme
 from semantic2d_dataset.simulation import mini
 
 PAPER_SHARES = {9: 37.9, 6: 13.3, 4: 11.4, 2: 10.5}  # %, section on the class distribution
@@ -71,7 +71,7 @@ def test_mini_is_six_environments_by_three_lidars(made):
     assert len({entry.environment for entry in manifest.sequences}) == 6
     assert len({entry.lidar for entry in manifest.sequences}) == 3
     assert sum(len(batch) for batch in batches.values()) == 6120
-    assert set(manifest.splits) == {"block", "frame", "environment"}
+    assert set(manifest.splits) == {"block", "frame", "environment", "lidar"}
     assert mini.combined_digest(manifest) == mini.MINI_DIGEST
 
 
