@@ -9,25 +9,20 @@ lidar stood is a scan that the other could have taken from there.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic2d_dataset.access.bearings import NO_BEAM, find_neighbours, find_positions, nearest_of
 from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.access.scan_source import Fields, ScanSource
 from semantic2d_dataset.access.torch_datasets import LidarDataset
-from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.scene.geometry import mount_in_plane
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.scans import check_array
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
-
-_NONE = -1  # the number of a beam that is not there
-_SAME = 1e-3  # beams; closer bearings are one
-_WIDEST_GAP = 1.5  # beams between the last and the first of a lidar that sees all around
-_LEVEL = 0.5  # least determinant of a mount, a tilt of 60 degrees
 
 # Neighbours farther apart than both lie on two surfaces: a surface cannot be seen at more than
 # 84 degrees of incidence (tangent 10), nor told from noise within 0.1 m.
@@ -66,10 +61,11 @@ class Reprojection:
 
     def __init__(self, source: LidarSpec, target: LidarSpec) -> None:
         self.source, self.target = source, target
-        self._left, self._right, self._weight = _neighbours(_positions(target, source), source)
-        left, right, weight = _neighbours(_positions(source, target), target)
-        self._nearest = np.where(weight < 0.5, left, right)
-        self.in_view: NDArray[np.bool_] = left != _NONE
+        self._left, self._right, self._weight = find_neighbours(
+            find_positions(target, source), source
+        )
+        self._nearest = nearest_of(source, target)
+        self.in_view: NDArray[np.bool_] = self._nearest != NO_BEAM
 
     def apply(
         self,
@@ -160,7 +156,11 @@ class ReprojectedSource(ScanSource):
         self.reprojection = Reprojection(self.lidar, target)
         self.lidar = target
 
-    def fetch(self, wanted: NDArray[np.int64]) -> tuple[Fields, NDArray[np.int64]]:
+    def fetch(
+        self,
+        wanted: NDArray[np.int64],
+        names: Collection[str] | None = None,  # noqa: ARG002 - a beam is resampled as a whole
+    ) -> tuple[Fields, NDArray[np.int64]]:
         """Return as `ScanSource.fetch` arrays and rows, the arrays with the target's beams."""
         fields, rows = super().fetch(wanted)
         measured = fields.get("intensities")
@@ -206,55 +206,6 @@ class ReprojectedScans(LidarDataset):
         return ReprojectedSource(data, target=self._target, **options)
 
 
-def _positions(beams_of: LidarSpec, on: LidarSpec) -> NDArray[np.float64]:
-    """Return where the beams of one lidar fall on the row of beams of another.
-
-    Returns
-    -------
-    (B,) f8, in beams of `on`, 0 its first; the fewest beams from the middle of the row.
-    """
-    to_base, from_base = (mount_in_plane(lidar.base_T_lidar)[0] for lidar in (beams_of, on))
-    for lidar, rotation in ((beams_of, to_base), (on, from_base)):
-        if abs(np.linalg.det(rotation)) < _LEVEL:
-            raise InvalidInputError(
-                f"lidar {lidar.name!r}: expected a level mount, found roll and pitch "
-                f"{lidar.base_T_lidar[3:5]} rad: its scans cannot be reprojected in the plane"
-            )
-    turned = np.linalg.solve(from_base, to_base)
-    sense = np.sign(np.linalg.det(turned))  # -1 where one of the two hangs upside down
-    bearings = sense * beams_of.bearings + np.arctan2(turned[1, 0], turned[0, 0])
-    positions = (bearings - on.angle_min) / on.angle_increment
-    circle = 2 * np.pi / on.angle_increment
-    # a little less than one, so that the two ends of a full circle stay where they are
-    turns = np.rint((1 - 1e-6) * (positions - (on.beams - 1) / 2) / circle)
-    found: NDArray[np.float64] = positions - turns * circle
-    whole = np.rint(found)
-    return np.where(np.abs(found - whole) < _SAME, whole, found)
-
-
-def _neighbours(
-    positions: NDArray[np.float64], lidar: LidarSpec
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return the beams on both sides of positions, (B,) i8 each, and how near the second is.
-
-    -1 stands for both where a position is more than half a beam out of the field of view.
-    """
-    last = lidar.beams - 1
-    gap = 2 * np.pi / lidar.angle_increment - last
-    left = np.clip(np.floor(positions), 0, last).astype(np.int64)
-    right = np.minimum(left + 1, last)
-    weight = np.clip(positions - left, 0.0, 1.0)
-    beside = (positions < 0) | (positions > last)
-    if gap <= _WIDEST_GAP:
-        beyond = np.where(positions < 0, positions + gap, positions - last)
-        left, right = np.where(beside, last, left), np.where(beside, 0, right)
-        weight = np.where(beside, beyond / gap, weight)
-    else:
-        outside = (positions < -0.5) | (positions > last + 0.5)
-        left, right = np.where(outside, _NONE, left), np.where(outside, _NONE, right)
-    return left, right, weight
-
-
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def _resample(
     ranges: NDArray[np.float32],
@@ -272,7 +223,7 @@ def _resample(
     for n in range(len(ranges)):
         for k in range(len(left)):
             a, b, w = left[k], right[k], weight[k]
-            if a == _NONE:
+            if a == NO_BEAM:
                 out_ranges[n, k], out_intensities[n, k] = np.inf, 0.0
                 out_labels[n, k] = UNLABELLED
                 continue
