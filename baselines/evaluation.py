@@ -21,7 +21,8 @@ from baselines.checkpoints import Checkpoint
 from baselines.inference import SAMPLES, infer_scans
 from baselines.sampled_labels import SampledLabels
 from baselines.speed import frames_per_second, processor_name
-from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
+from semantic2d_dataset.access.torch_batches import Batch
+from semantic2d_dataset.access.torch_datasets import LidarDataset
 from semantic2d_dataset.format.writing import write_text_atomically
 from semantic2d_dataset.scene.taxonomy import UNLABELLED, Taxonomy
 from semantic2d_dataset.scoring.calibration import Calibration

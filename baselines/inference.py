@@ -17,7 +17,8 @@ from baselines.networks import Latent, SegmentationNetwork
 from baselines.s3net import S3Net
 from baselines.sampled_labels import SampledLabels, check_draw
 from baselines.steps import keep_freed_memory
-from semantic2d_dataset.access.torch_datasets import Batch, LidarDataset
+from semantic2d_dataset.access.torch_batches import Batch
+from semantic2d_dataset.access.torch_datasets import LidarDataset
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scoring.submission import PredictionsWriter
 

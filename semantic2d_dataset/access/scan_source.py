@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import itertools
 import os
-from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from semantic2d_dataset.access.chunk_cache import ChunkCache
+from semantic2d_dataset.access.class_counts import count_classes
 from semantic2d_dataset.access.features import Moments, Statistics, features_of
 from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.errors import CorruptFileError, DatasetNotFoundError
@@ -27,7 +29,7 @@ Fields = Mapping[str, NDArray[Any]]
 
 _STATISTICS_SCANS = 20_000
 _MEMORY_SHARE = 0.5
-_CACHED_CHUNKS = 64
+_MAX_ROWS = 1 << 40  # more than a sequence can have
 _CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 
@@ -64,22 +66,15 @@ class ScanSource:
         scheme: str,
         in_memory: bool | None = None,
     ) -> None:
-        self.data, self.split, self.scheme = data, split, scheme
+        self.data, self.scheme = data, scheme
         self._readers = [data.reader(entry.id) for entry in data.sequences(lidar)]
         header = self._readers[0].header
         self.lidar, self.taxonomy = header.lidar, header.taxonomy
         self._check_alike()
-        self._rows = [self._members(reader) for reader in self._readers]
-        self._all_rows = np.concatenate(self._rows)
-        self._starts = np.cumsum([0, *map(len, self._rows)]).tolist()
-        if not len(self):
-            raise DatasetNotFoundError(
-                f"{data.manifest.name}: {self.lidar.name} has no scan in the split {split!r} "
-                f"of the scheme {scheme!r}"
-            )
         self.has_intensities = all("scans/intensities" in reader for reader in self._readers)
+        self._chunks = ChunkCache()
+        self._choose(split)
         self.in_memory = self._fits() if in_memory is None else in_memory
-        self._chunks: OrderedDict[tuple[int, int], Fields] = OrderedDict()
         if self.in_memory:
             self._memory  # noqa: B018 - read now, so that workers started by fork share it
 
@@ -88,19 +83,62 @@ class ScanSource:
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle without data: a process started by spawn reads its own."""
-        large = ("_memory", "scan_ids")
-        kept = {key: value for key, value in self.__dict__.items() if key not in large}
-        return kept | {"_chunks": OrderedDict()}
+        large = ("_memory", "scan_ids", "scan_class_counts")
+        return {key: value for key, value in self.__dict__.items() if key not in large}
 
-    def fetch(self, wanted: NDArray[np.int64]) -> tuple[Fields, NDArray[np.int64]]:
+    def of_split(self, split: str | None) -> Self:
+        """Return the scans of another split, streamed from the same open files.
+
+        Raises
+        ------
+        DatasetNotFoundError, InvalidInputError
+            If the split is unknown or empty.
+        """
+        other = copy.copy(self)
+        other.in_memory = False
+        other._choose(split)  # noqa: SLF001 - a copy of this one
+        return other
+
+    def fetch(
+        self, wanted: NDArray[np.int64], names: Collection[str] | None = None
+    ) -> tuple[Fields, NDArray[np.int64]]:
         """Return arrays and the rows in them that hold the wanted scans.
 
         Fields are ``ranges`` (N, B) f4, ``intensities`` (N, B) f4 where the lidar gives them,
         ``labels`` (N, B) u1 and ``poses`` (N, 3) f8.
+
+        Parameters
+        ----------
+        wanted
+            (n,) i8, numbers of scans in the split.
+        names
+            Fields that are needed, if not all are: no others are read.
         """
         if self.in_memory:
             return self._memory, wanted
-        return self._gather(wanted), np.arange(len(wanted))
+        chosen = [name for name in self.fields if names is None or name in names]
+        return self._gather(wanted, chosen), np.arange(len(wanted))
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields there are."""
+        return ("ranges", "poses", "labels") + ("intensities",) * self.has_intensities
+
+    def places_of(self, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the sequence, counted from 0, and the index in it of scans of the split."""
+        return np.searchsorted(self._starts, numbers, side="right") - 1, self._all_rows[numbers]
+
+    def numbers_at(
+        self, sequences: NDArray[np.int64], rows: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Return the number in the split of the scans at some places, -1 where it has no such."""
+        keys = sequences * _MAX_ROWS + rows
+        found = np.minimum(np.searchsorted(self._keys, keys), len(self) - 1)
+        return np.where(self._keys[found] == keys, found, -1)
+
+    def read_stamps(self) -> list[NDArray[np.int64]]:
+        """Read the stamps of every scan of every sequence, of any split, (N,) i8 each."""
+        return [reader.read("scans/stamps_ns") for reader in self._readers]
 
     @cached_property
     def scan_ids(self) -> NDArray[np.object_]:
@@ -109,37 +147,62 @@ class ScanSource:
         pairs = zip(names, self._rows, strict=True)
         return np.array([f"{name}/{row}" for name, rows in pairs for row in rows], np.object_)
 
-    def chunk_runs(self) -> list[range]:
-        """Return the runs of scans that lie in one chunk of one file."""
+    def chunk_runs(self, chunks: int = 1) -> list[range]:
+        """Return the runs of scans that lie in one chunk of one file, or in so many neighbours."""
         runs = []
         for start, rows in zip(self._starts[:-1], self._rows, strict=True):
-            borders = np.flatnonzero(np.diff(rows // CHUNK_ROWS, prepend=-1, append=-1))
+            numbers = rows // (chunks * CHUNK_ROWS)
+            borders = np.flatnonzero(np.diff(numbers, prepend=-1, append=-1))
             runs += [range(start + int(a), start + int(b)) for a, b in itertools.pairwise(borders)]
         return runs
 
     def compute_statistics(self, which: str) -> Statistics:
         """Compute mean and standard deviation of feature channels over beams with a return.
 
-        At most 20,000 scans, evenly spaced, are read.
+        Of a split of more than 20,000 scans, whole chunks are read, evenly spaced, that hold
+        about as many.
         """
         step = -(-len(self) // _STATISTICS_SCANS)
         moments = Moments()
-        for run in self.chunk_runs():
-            first = -(-run.start // step) * step
-            fields, rows = self.fetch(np.arange(first, run.stop, step))
+        names = {"ranges", "intensities"} if "I" in which else {"ranges"}
+        for run in self.chunk_runs()[::step]:
+            fields, rows = self.fetch(np.arange(run.start, run.stop), names)
             ranges = fields["ranges"]
             raw = features_of(ranges, fields.get("intensities"), self.lidar, which, rows=rows)
             moments.update(raw, self.lidar.has_return(ranges[rows]))
         return moments.compute()
 
+    @cached_property
+    def scan_class_counts(self) -> NDArray[np.int32]:
+        """Labelled beams with a return of each scan by class id, (N, K) i4; reads every chunk."""
+        counts = np.empty((len(self), len(self.taxonomy)), np.int32)
+        bar = tqdm(self.chunk_runs(), desc="counting classes", disable=None, leave=False, delay=2)
+        for run in bar:
+            fields, rows = self.fetch(np.arange(run.start, run.stop), {"ranges", "labels"})
+            ranges, labels = fields["ranges"][rows], fields["labels"][rows]
+            counts[run.start : run.stop] = count_classes(
+                ranges, labels, self.lidar, len(self.taxonomy)
+            )
+        return counts
+
     def class_counts(self) -> NDArray[np.int64]:
         """Count the labelled beams with a return by class id, (C,) i8."""
-        counts = np.zeros(256, np.int64)
-        for run in self.chunk_runs():
-            fields, rows = self.fetch(np.arange(run.start, run.stop))
-            labels, ranges = fields["labels"][rows], fields["ranges"][rows]
-            counts += np.bincount(labels[self.lidar.has_return(ranges)], minlength=256)
-        return counts[: len(self.taxonomy)]
+        total: NDArray[np.int64] = self.scan_class_counts.sum(axis=0, dtype=np.int64)
+        return total
+
+    def _choose(self, split: str | None) -> None:
+        """Take the scans of a split."""
+        self.split = split
+        self._rows = [self._members(reader) for reader in self._readers]
+        self._all_rows = np.concatenate(self._rows)
+        self._starts = np.cumsum([0, *map(len, self._rows)]).tolist()
+        if not len(self):
+            raise DatasetNotFoundError(
+                f"{self.data.manifest.name}: {self.lidar.name} has no scan in the split "
+                f"{split!r} of the scheme {self.scheme!r}"
+            )
+        sequences = np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows])
+        self._keys = sequences * _MAX_ROWS + self._all_rows
 
     @cached_property
     def _memory(self) -> Fields:
@@ -154,51 +217,47 @@ class ScanSource:
         kept: dict[str, NDArray[Any]] = {}
         start = 0
         for reader, rows in bar:
-            for name, values in self._read(reader, 0, None).items():
+            for name in self.fields:
+                values = self._read(reader, name, 0, None)
                 if name not in kept:
                     kept[name] = np.empty((len(self), *values.shape[1:]), values.dtype)
                 kept[name][start : start + len(rows)] = values[rows]
             start += len(rows)
         return kept
 
-    def _gather(self, wanted: NDArray[np.int64]) -> Fields:
+    def _gather(self, wanted: NDArray[np.int64], names: list[str]) -> Fields:
         """Collect scans from whole chunks, each read once."""
         if not wanted.size:
-            return {name: values[:0] for name, values in self._chunk(0, 0).items()}
-        numbers = np.searchsorted(self._starts, wanted, side="right") - 1
-        rows = self._all_rows[wanted]
-        keys = numbers * (1 << 40) + rows // CHUNK_ROWS
+            return {name: values[:0] for name, values in self._chunk(0, 0, names).items()}
+        numbers, rows = self.places_of(wanted)
+        keys = numbers * _MAX_ROWS + rows // CHUNK_ROWS
         order = np.argsort(keys, kind="stable")
         groups = np.split(order, np.flatnonzero(np.diff(keys[order])) + 1)
         parts = []
         for group in groups:
             number, chunk = int(numbers[group[0]]), int(rows[group[0]] // CHUNK_ROWS)
             local = rows[group] - chunk * CHUNK_ROWS
-            parts.append({n: v[local] for n, v in self._chunk(number, chunk).items()})
+            parts.append({n: v[local] for n, v in self._chunk(number, chunk, names).items()})
         back = np.argsort(order)
-        return {n: np.concatenate([part[n] for part in parts])[back] for n in parts[0]}
+        return {n: np.concatenate([part[n] for part in parts])[back] for n in names}
 
-    def _chunk(self, number: int, chunk: int) -> Fields:
-        key = (number, chunk)
-        if key not in self._chunks:
-            start = chunk * CHUNK_ROWS
-            self._chunks[key] = self._read(self._readers[number], start, start + CHUNK_ROWS)
-            if len(self._chunks) > _CACHED_CHUNKS:
-                self._chunks.popitem(last=False)
-        self._chunks.move_to_end(key)
-        return self._chunks[key]
+    def _chunk(self, number: int, chunk: int, names: list[str]) -> Fields:
+        kept = self._chunks.take(number, chunk)
+        start = chunk * CHUNK_ROWS
+        for name in names:
+            if name not in kept:
+                kept[name] = self._read(self._readers[number], name, start, start + CHUNK_ROWS)
+        return {name: kept[name] for name in names}
 
-    def _read(self, reader: SequenceReader, start: int, stop: int | None) -> Fields:
-        ranges = reader.read("scans/ranges", start, stop)
-        fields = {"ranges": ranges, "poses": reader.read_poses(start, stop)}
-        fields["labels"] = (
-            reader.read("scans/labels", start, stop)
-            if "scans/labels" in reader
-            else np.full(ranges.shape, UNLABELLED, np.uint8)
-        )
-        if self.has_intensities:
-            fields["intensities"] = reader.read("scans/intensities", start, stop)
-        return fields
+    def _read(
+        self, reader: SequenceReader, name: str, start: int, stop: int | None
+    ) -> NDArray[Any]:
+        if name == "poses":
+            return reader.read_poses(start, stop)
+        if name == "labels" and "scans/labels" not in reader:
+            rows = len(range(*slice(start, stop).indices(len(reader))))
+            return np.full((rows, reader.lidar.beams), UNLABELLED, np.uint8)
+        return reader.read(f"scans/{name}", start, stop)
 
     def _members(self, reader: SequenceReader) -> NDArray[np.int64]:
         if self.split is None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self, overload
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset
 
 from semantic2d_dataset.access.buffers import Buffers
 from semantic2d_dataset.access.features import (
@@ -20,48 +18,33 @@ from semantic2d_dataset.access.features import (
     normalise_features,
     targets_of,
 )
+from semantic2d_dataset.access.histories import History, PastScans
 from semantic2d_dataset.access.registry import OpenDataset, open_dataset
 from semantic2d_dataset.access.scan_source import Fields, ScanSource
-from semantic2d_dataset.access.torch_samplers import BlockShuffleSampler
+from semantic2d_dataset.access.torch_batches import Batch, BatchedDataset
 from semantic2d_dataset.access.transforms import Transform
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.geometry import incidence_angles
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW, RPLIDAR_S2, WLR_716, LidarSpec
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 
-Batch = dict[str, Any]
+# A past scan lies in the same chunk, or in the one before: neighbours are read together.
+_CHUNKS_WITH_PAST = 4
 
 
-class BatchView(Sequence[Batch]):
-    """A collated batch that also reads as the list of its items, for any collate function."""
-
-    def __init__(self, batch: Batch) -> None:
-        self.batch = batch
-
-    def __len__(self) -> int:
-        return len(self.batch["scan_id"])
-
-    @overload
-    def __getitem__(self, index: int) -> Batch: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Batch]: ...
-    def __getitem__(self, index: int | slice) -> Batch | list[Batch]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return {key: value[index] for key, value in self.batch.items()}
-
-
-class LidarDataset(Dataset[Batch]):
+class LidarDataset(BatchedDataset):
     """Labelled scans of one lidar from one split of a data set.
 
     Items are dicts of tensors. Without `features`: ``ranges``, ``intensities`` (where the lidar
     gives them), ``incidence``, each (B,) f4 in m, sensor units and rad; ``label`` (B,) i64, 255
     where unlabelled; ``valid`` (B,) bool, true where the beam has a return; ``pose`` (3,) f8 x y
     yaw; ``scan_id`` str. With `features`: ``features`` (C, B) f4, standardised, and ``label``,
-    ``valid``, ``scan_id``.
-
-    A DataLoader fetches whole batches at once; give it ``collate_fn=dataset.collate``, or use
-    `loader`, which also shuffles by blocks where the data does not fit in memory.
+    ``valid``, ``scan_id``. With `history`, k past scans besides, the oldest first:
+    ``history_features`` (k, C, B) f4, standardised alike, or ``history_ranges`` and
+    ``history_intensities`` (k, B) f4; ``history_poses`` (k, 3) f4, the past base in the current
+    base's frame; ``history_valid`` (k,) bool, whether there is such a scan; ``history_dt_s``
+    (k,) f4, its age; where asked for, ``history_points`` (k, B, 2) f4 and ``history_label``
+    (k, B) i64. A scan that is not there has no return.
 
     Parameters
     ----------
@@ -87,6 +70,9 @@ class LidarDataset(Dataset[Batch]):
         Its randomness comes from this seed and the indices of the batch, in their order: it is
         the same with any number of workers, and differs between epochs that are shuffled, but
         for a scan that is a batch by itself.
+    history
+        Past scans that come with each scan; not beside a transform, which would not change them
+        alike.
 
     Raises
     ------
@@ -110,6 +96,7 @@ class LidarDataset(Dataset[Batch]):
         in_memory: bool | None = None,
         transform: Transform | None = None,
         transform_seed: int = 0,
+        history: History | None = None,
     ) -> None:
         name = lidar or (self.spec.name if self.spec else None)
         if name is None:
@@ -117,7 +104,11 @@ class LidarDataset(Dataset[Batch]):
         self.features = None if features is None else normalise_features(features)
         self.transform, self.transform_seed = transform, transform_seed
         self._buffers = Buffers()
-        self._measured_by = name
+        if history is not None and transform is not None:
+            raise InvalidInputError(
+                "a transform changes each scan by itself, so that its past would not fit it; "
+                "give either history or transform"
+            )
         self.source = self.open_source(
             data, lidar=name, split=split, scheme=scheme, in_memory=in_memory
         )
@@ -126,9 +117,11 @@ class LidarDataset(Dataset[Batch]):
                 f"{data.manifest.name}: {self.lidar.name} gives no intensities; leave I out of "
                 f"the features {self.features}"
             )
+        self._past = PastScans(self.source, history) if history else None
+        self.chunks_in_run = 1 if history is None else _CHUNKS_WITH_PAST
         self._statistics: Statistics | None = None
         if self.features:
-            found = statistics or self._train_source().compute_statistics(self.features)
+            found = statistics or _train_part(self.source).compute_statistics(self.features)
             if len(found.mean) != channel_count(self.features):
                 raise InvalidInputError(
                     f"features {self.features} have {channel_count(self.features)} channels, the "
@@ -148,22 +141,25 @@ class LidarDataset(Dataset[Batch]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, index: int) -> Batch:
-        return self.__getitems__([index])[0]
-
-    def __getitems__(self, indices: Sequence[int]) -> BatchView:
-        """Fetch the items of a whole batch at once."""
-        wanted = np.asarray(indices, np.int64)
-        wanted = np.where(wanted < 0, wanted + len(self), wanted)
-        if wanted.size and not (wanted.min() >= 0 and wanted.max() < len(self)):
-            raise IndexError(f"expected indices below {len(self)}, found {list(indices)}")
+    def fetch_batch(self, wanted: NDArray[np.int64]) -> Batch:
+        """Return a collated batch of the items of numbers from 0 on."""
         fields, rows = self.source.fetch(wanted)
         if self.transform is not None:
             fields = {name: values[rows] for name, values in fields.items()}
             rng = np.random.default_rng((self.transform_seed, *wanted.tolist()))
             fields, rows = self.transform(fields, self.lidar, rng), np.arange(len(wanted))
         ids = self.source.scan_ids[wanted].tolist()
-        return BatchView(self._tensors(fields, rows) | {"scan_id": ids})
+        batch = self._tensors(fields, rows) | {"scan_id": ids}
+        return batch if self._past is None else batch | self._past_tensors(wanted, self._past)
+
+    def chunk_runs(self) -> list[range]:
+        """Return runs of items that are read together."""
+        return self.source.chunk_runs(self.chunks_in_run)
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether the split is kept in memory."""
+        return self.source.in_memory
 
     @property
     def lidar(self) -> LidarSpec:
@@ -196,47 +192,10 @@ class LidarDataset(Dataset[Batch]):
         """Number of labelled beams with a return by class id, (C,) i8, over this split."""
         return self.source.class_counts()
 
-    @staticmethod
-    def collate(items: Sequence[Batch]) -> Batch:
-        """Collate a batch; what ``__getitems__`` returned is one already."""
-        if isinstance(items, BatchView):
-            return items.batch
-        collated: Batch = torch.utils.data.default_collate(list(items))
-        return collated
-
-    def loader(
-        self, batch_size: int = 256, *, shuffle: bool = False, seed: int = 0, **options: Any
-    ) -> DataLoader[Batch]:
-        """Return a DataLoader suited to this data set.
-
-        Parameters
-        ----------
-        batch_size
-            Items in a batch.
-        shuffle
-            Draw a new order each epoch: over everything in memory, by blocks otherwise.
-        seed
-            Seed of the order.
-        options
-            Passed on to `torch.utils.data.DataLoader`.
-        """
-        if shuffle and not self.source.in_memory:
-            options["sampler"] = BlockShuffleSampler(self.source.chunk_runs(), seed=seed)
-        elif shuffle:
-            options |= {"shuffle": True, "generator": torch.Generator().manual_seed(seed)}
-        return DataLoader(self, batch_size=batch_size, collate_fn=self.collate, **options)
-
-    def _train_source(self) -> ScanSource:
-        source = self.source
-        if source.split == "train":
-            return source
-        return self.open_source(
-            source.data,
-            lidar=self._measured_by,
-            split="train",
-            scheme=source.scheme,
-            in_memory=False,
-        )
+    @property
+    def scan_class_counts(self) -> NDArray[np.int32]:
+        """Labelled beams with a return of each scan by class id, (N, K) i4."""
+        return self.source.scan_class_counts
 
     def _tensors(self, fields: Fields, rows: NDArray[np.int64]) -> Batch:
         label, valid = targets_of(
@@ -264,6 +223,29 @@ class LidarDataset(Dataset[Batch]):
             batch["intensities"] = torch.from_numpy(fields["intensities"][rows])
         return batch
 
+    def _past_tensors(self, wanted: NDArray[np.int64], past: PastScans) -> Batch:
+        """Return the past of some items: k scans each, whose beams are computed like theirs."""
+        found = past.fetch(wanted)
+        if self.features:
+            shape = found["ranges"].shape
+            flat = {
+                name: found.pop(name).reshape(-1, shape[-1])
+                for name in ("ranges", "intensities")
+                if name in found
+            }
+            inputs = features_of(
+                flat["ranges"],
+                flat.get("intensities"),
+                self.lidar,
+                self.features,
+                self.statistics,
+                buffers=self._buffers,
+            )
+            found["features"] = inputs.reshape(*shape[:2], -1, shape[-1])
+        if "labels" in found:
+            found["label"] = found.pop("labels").astype(np.int64)
+        return {f"history_{name}": torch.from_numpy(found[name]) for name in found}
+
 
 class HokuyoUTM30LXEW(LidarDataset):
     """Scans of the Hokuyo UTM-30LX-EW: 1081 beams over 270 degrees."""
@@ -281,6 +263,10 @@ class RPLidarS2(LidarDataset):
     """Scans of the RPLIDAR-S2: 1972 beams over 360 degrees."""
 
     spec = RPLIDAR_S2
+
+
+def _train_part(source: ScanSource) -> ScanSource:
+    return source if source.split == "train" else source.of_split("train")
 
 
 _CLASSES = {

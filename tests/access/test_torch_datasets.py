@@ -9,7 +9,6 @@ from torch.utils.data import DataLoader
 import semantic2d_dataset
 from semantic2d_dataset import HokuyoUTM30LXEW, LidarDataset, load_dataset, open_dataset
 from semantic2d_dataset.access.features import Statistics
-from semantic2d_dataset.access.torch_samplers import BlockShuffleSampler
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
 from semantic2d_dataset.scene.geometry import incidence_angles
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW
@@ -134,16 +133,6 @@ def test_shuffling_follows_the_seed(folder):
     ]
     assert orders[0] == orders[1] != orders[2]
     assert sorted(orders[0]) == sorted(orders[2])
-
-
-def test_block_shuffling_reads_few_chunks_for_a_batch():
-    runs = [range(i * 64, (i + 1) * 64) for i in range(100)]
-    sampler = BlockShuffleSampler(runs, seed=3, window=4)
-    first, second = list(sampler), list(sampler)
-    assert sorted(first) == sorted(second) == list(range(6400))
-    assert first != second
-    for start in range(0, 6400, 256):
-        assert len({i // 64 for i in first[start : start + 256]}) <= 4
 
 
 def test_class_counts_and_taxonomy_describe_the_split(folder):
