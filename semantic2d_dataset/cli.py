@@ -17,6 +17,7 @@ import typer
 import semantic2d_dataset
 from semantic2d_dataset.cli_data import download, verify
 from semantic2d_dataset.cli_options import AsJson
+from semantic2d_dataset.cli_table import table
 from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
 from semantic2d_dataset.pipeline.siblings import load_sibling
 
@@ -113,6 +114,7 @@ def info(
 
 app.command()(verify)
 app.command()(download)
+app.command()(table)
 
 
 @app.command()

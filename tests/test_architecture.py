@@ -31,6 +31,7 @@ ROOMS = (
     "cli_data",
     "cli_publishing",
     "cli_splits",
+    "cli_table",
     "cli",
 )
 FILES = [p for package in PACKAGES for p in sorted((PROJECT / package).rglob("*.py"))]

@@ -12,8 +12,8 @@ from semantic2d_dataset.scene.lidars import LidarSpec
 
 def count_classes(
     ranges: NDArray[np.float32], labels: NDArray[np.uint8], lidar: LidarSpec, classes: int
-) -> NDArray[np.int32]:
-    """Count the labelled beams with a return of each scan by class id.
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Count the labelled beams with a return of each scan by class id, and all with a return.
 
     Parameters
     ----------
@@ -26,11 +26,14 @@ def count_classes(
 
     Returns
     -------
-    (N, K) i4
+    counts, returns
+        (N, K) and (N,) i4.
     """
     counts = np.zeros((len(ranges), classes), np.int32)
-    _count(ranges, labels, np.float32(lidar.range_min), np.float32(lidar.range_max), counts)
-    return counts
+    returns = np.zeros(len(ranges), np.int32)
+    limits = np.float32(lidar.range_min), np.float32(lidar.range_max)
+    _count(ranges, labels, limits, counts, returns)
+    return counts, returns
 
 
 def balancing_weights(counts: NDArray[np.integer], power: float) -> NDArray[np.float64]:
@@ -72,12 +75,14 @@ def balancing_weights(counts: NDArray[np.integer], power: float) -> NDArray[np.f
 def _count(
     ranges: NDArray[np.float32],
     labels: NDArray[np.uint8],
-    range_min: np.float32,
-    range_max: np.float32,
+    limits: tuple[np.float32, np.float32],
     counts: NDArray[np.int32],
+    returns: NDArray[np.int32],
 ) -> None:
     for n in range(len(ranges)):
         for k in range(ranges.shape[1]):
             r, label = ranges[n, k], labels[n, k]
-            if r > 0 and r >= range_min and r < range_max and label < counts.shape[1]:
-                counts[n, label] += 1
+            if r > 0 and r >= limits[0] and r < limits[1]:
+                returns[n] += 1
+                if label < counts.shape[1]:
+                    counts[n, label] += 1

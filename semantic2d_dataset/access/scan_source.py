@@ -74,9 +74,7 @@ class ScanSource:
         self.has_intensities = all("scans/intensities" in reader for reader in self._readers)
         self._chunks = ChunkCache()
         self._choose(split)
-        self.in_memory = self._fits() if in_memory is None else in_memory
-        if self.in_memory:
-            self._memory  # noqa: B018 - read now, so that workers started by fork share it
+        self._keep(in_memory=in_memory)
 
     def __len__(self) -> int:
         return int(self._starts[-1])
@@ -180,15 +178,19 @@ class ScanSource:
         for run in bar:
             fields, rows = self.fetch(np.arange(run.start, run.stop), {"ranges", "labels"})
             ranges, labels = fields["ranges"][rows], fields["labels"][rows]
-            counts[run.start : run.stop] = count_classes(
-                ranges, labels, self.lidar, len(self.taxonomy)
-            )
+            found, _ = count_classes(ranges, labels, self.lidar, len(self.taxonomy))
+            counts[run.start : run.stop] = found
         return counts
 
     def class_counts(self) -> NDArray[np.int64]:
         """Count the labelled beams with a return by class id, (C,) i8."""
         total: NDArray[np.int64] = self.scan_class_counts.sum(axis=0, dtype=np.int64)
         return total
+
+    def _keep(self, *, in_memory: bool | None) -> None:
+        self.in_memory = self._fits() if in_memory is None else in_memory
+        if self.in_memory:
+            self._memory  # noqa: B018 - read now, so that workers started by fork share it
 
     def _choose(self, split: str | None) -> None:
         """Take the scans of a split."""
