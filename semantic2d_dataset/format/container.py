@@ -100,6 +100,10 @@ class ContainerReader:
         dtype: np.dtype[Any] = self._guard(lambda: self._array(name).dtype)
         return dtype
 
+    def chunks(self, name: str) -> tuple[int, ...]:
+        """Return the shape of an array's chunks."""
+        return tuple(self._guard(lambda: self._array(name).chunks))
+
     def stored_bytes(self, name: str) -> int:
         """Return how many bytes an array takes in the file."""
         return int(self._guard(self._array(name).id.get_storage_size))
@@ -140,7 +144,7 @@ class ContainerReader:
     def blocks(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield an array in runs of whole chunks."""
         rows = self.shape(name)[0]
-        step = self._guard(lambda: self._array(name).chunks[0])
+        step = self.chunks(name)[0]
         for start in range(0, rows, step):
             yield self.read(name, start, min(start + step, rows))
 

@@ -182,6 +182,17 @@ class Calibration:
         return float((rest * np.log(ratio) + slopes * points).sum() / kept[-1])
 
 
+def are_probabilities(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Tell which rows (..., K) of class probabilities are numbers from 0 to 1 that add up to 1.
+
+    This is what `Calibration.update` accepts.
+    """
+    rows = values.reshape(-1, values.shape[-1]).astype(np.float32, copy=False)
+    found = np.empty(len(rows), np.bool_)
+    _check_rows(rows, found)
+    return found.reshape(values.shape[:-1])
+
+
 def _columns(
     table: NDArray[np.int64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -266,6 +277,17 @@ def _count(
         _add(confidence, np.float64(probabilities[i, best]), 1.0, hit)
         _add(entropy, min(spread, most), most, hit)
     return -1
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _check_rows(rows: NDArray[np.float32], found: NDArray[np.bool_]) -> None:
+    for i in range(len(rows)):
+        total, outside = 0.0, 0
+        for k in range(rows.shape[1]):
+            p = np.float64(rows[i, k])
+            outside += not 0.0 <= p <= 1.0  # also NaN
+            total += p
+        found[i] = outside == 0 and abs(total - 1.0) <= _SUM_TOLERANCE
 
 
 @numba.njit(error_model="numpy")

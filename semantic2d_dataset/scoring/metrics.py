@@ -36,7 +36,8 @@ MEANS = {"mIoU": "iou", "mCA": "ca", "mCA_tn": "ca_tn"}
 RESULT_KEYS = (
     *MEANS,
     *("confusion", "points", "ignored", "classes_averaged"),
-    *("per_lidar", "submission"),  # of `submission.score_predictions`
+    # of `submission.score_predictions`
+    *("per_lidar", "conditions", "intervals", "calibration", "samples", "submission"),
 )
 """The keys of a result beside the names of the classes."""
 

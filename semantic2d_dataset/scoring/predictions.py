@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import resources
+from itertools import islice
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,12 +15,17 @@ import jsonschema
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, UnsafeFileError
 from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.schema import PREDICTIONS
 from semantic2d_dataset.format.writing import ContainerWriter, root_attributes
 from semantic2d_dataset.scene.scans import check_array
 from semantic2d_dataset.scene.taxonomy import Taxonomy
+
+MAX_SAMPLES = 1024
+_MAX_METADATA_BYTES = 1 << 16
+_MAX_BLOCK_BYTES = 1 << 26
+_PROBLEMS, _MESSAGE = 50, 300  # of metadata: how many are listed, and how long each is
 
 
 class PredictionsWriter:
@@ -187,8 +194,21 @@ class PredictionsReader:
 
     @property
     def metadata(self) -> Any:
-        """What the file says about its method, whatever JSON value that is; None without."""
-        return self._container.read_json("metadata") if "metadata" in self._container else None
+        """What the file says about its method, whatever JSON value that is; None without.
+
+        Raises
+        ------
+        CorruptFileError
+            If it is no JSON, or longer than 64 KiB.
+        """
+        if "metadata" not in self._container:
+            return None
+        size = self._container.shape("metadata")[0]
+        if size > _MAX_METADATA_BYTES:
+            raise CorruptFileError(
+                f"{self.path}: metadata: expected at most {_MAX_METADATA_BYTES} bytes, found {size}"
+            )
+        return self._container.read_json("metadata")
 
     def has(self, sequence_id: str, part: str) -> bool:
         """Tell whether scan_index, labels, probabilities or samples of a sequence are there."""
@@ -205,14 +225,37 @@ class PredictionsReader:
         return self._container.read(_path(sequence_id, part), start, stop)
 
     def blocks(self, sequence_id: str, part: str) -> Iterator[NDArray[Any]]:
-        """Yield one part of a sequence's predictions in runs of whole chunks."""
-        return self._container.blocks(_path(sequence_id, part))
+        """Yield one part of a sequence's predictions in runs of whole chunks.
+
+        Raises
+        ------
+        UnsafeFileError
+            If a run would take more than 64 MiB.
+        """
+        name = _path(sequence_id, part)
+        shape, chunks = self._container.shape(name), self._container.chunks(name)
+        size = (
+            min(chunks[0], shape[0]) * math.prod(shape[1:]) * self._container.dtype(name).itemsize
+        )
+        if size > _MAX_BLOCK_BYTES:
+            raise UnsafeFileError(
+                f"{self.path}: {name}: its chunks {chunks} make readers hold {size} bytes at once; "
+                f"at most {_MAX_BLOCK_BYTES} are read: store fewer rows in a chunk"
+            )
+        return self._container.blocks(name)
 
 
 def metadata_problems(metadata: Any) -> list[str]:
     """List what keeps metadata from fitting ``metadata.schema.json``."""
     found = jsonschema.Draft202012Validator(_metadata_schema()).iter_errors(metadata)
-    return [f"metadata{error.json_path.removeprefix('$')}: {error.message}" for error in found]
+    return [
+        f"metadata{_cut(error.json_path.removeprefix('$'))}: {_cut(error.message)}"
+        for error in islice(found, _PROBLEMS)
+    ]
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _MESSAGE else f"{text[:_MESSAGE]} ..."
 
 
 def _path(sequence_id: str, part: str) -> str:

@@ -23,7 +23,7 @@ from semantic2d_dataset.format.sequence import SequenceHeader, SequenceReader, S
 from semantic2d_dataset.format.splits import NONE, TEST, VAL, SplitScheme
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
-from semantic2d_dataset.scoring import submission
+from semantic2d_dataset.scoring import tallies
 from semantic2d_dataset.scoring.metrics import EVALUATOR_VERSION, Evaluator
 from semantic2d_dataset.scoring.submission import (
     PredictionsReader,
@@ -262,7 +262,7 @@ def test_order_and_blocks_never_change_the_score(dataset, predictions, tmp_path,
     expected = score_predictions(predictions, dataset)
     order = np.random.default_rng(3).permutation(len(TEST_SCANS))
     shuffled = write_predictions(tmp_path / "p.h5", dataset, order=order, blocks=3)
-    monkeypatch.setattr(submission, "_BLOCK", 7)
+    monkeypatch.setattr(tallies, "_BLOCK", 7)
     found = score_predictions(shuffled, dataset)
     del expected["submission"], found["submission"]
     assert found == expected
@@ -371,12 +371,32 @@ def test_wrong_contents_are_named_with_sequence_and_scan(dataset, copy, mutation
 @pytest.mark.parametrize("value", [np.nan, np.inf, -0.5, 1.5])
 def test_probabilities_outside_zero_to_one_are_a_problem(dataset, copy, value):
     probabilities = np.full((len(TEST_SCANS), 12, 10), 0.1, np.float16)
-    replace(copy, f"predictions/{FIRST}/probabilities", probabilities)
+    for entry in dataset.manifest.sequences:
+        beams = dataset.reader(entry.id).lidar.beams
+        replace(copy, f"predictions/{entry.id}/probabilities", probabilities[:, :beams])
     assert validate(copy, dataset) == []
     probabilities[9, 3, 2] = value
     replace(copy, f"predictions/{FIRST}/probabilities", probabilities)
     (problem,) = validate(copy, dataset)
-    assert problem.startswith(f"{FIRST}/11: probabilities: beam 3 holds {value}")
+    assert problem.startswith(f"{FIRST}/11: probabilities: beam 3 holds [")
+    assert f" {value}" in problem
+
+
+def test_probabilities_that_do_not_add_up_to_one_are_a_problem(dataset, copy):
+    probabilities = np.full((len(TEST_SCANS), 9, 10), 0.2, np.float16)
+    replace(copy, "predictions/hall--a--far/probabilities", probabilities)
+    assert any("numbers from 0 to 1 that add up to 1" in line for line in validate(copy, dataset))
+
+
+def test_optional_parts_are_given_for_all_sequences_or_for_none(dataset, copy):
+    replace(copy, f"predictions/{FIRST}/samples", first_labels()[None])
+    (problem,) = validate(copy, dataset)
+    assert problem.startswith("hall--a--far: samples are missing; 1 of 3 sequences have them")
+    replace(copy, "predictions/hall--b--near/samples", np.stack([first_labels()] * 2))
+    replace(copy, "predictions/hall--a--far/samples", first_labels()[None, :, :9])
+    assert validate(copy, dataset) == [
+        "hall--b--near: samples: 2, but 1 in hall--a--far; draw the same number"
+    ]
 
 
 @pytest.mark.parametrize("array", [first_labels().astype(np.int64), first_labels()[None]])
