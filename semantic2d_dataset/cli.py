@@ -16,14 +16,14 @@ import typer
 
 import semantic2d_dataset
 from semantic2d_dataset.cli_data import download, verify
-from semantic2d_dataset.cli_options import AsJson
+from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
+from semantic2d_dataset.cli_submission import compare, report, score, submission
 from semantic2d_dataset.cli_table import table
 from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
 from semantic2d_dataset.pipeline.siblings import load_sibling
 
 if TYPE_CHECKING:
     from semantic2d_dataset.access.registry import OpenDataset
-    from semantic2d_dataset.scoring.predictions import PredictionsReader
 
 app = typer.Typer(
     name="semantic2d",
@@ -72,9 +72,11 @@ def main() -> None:
 
 
 def _message(err: Exception) -> str:
+    """Return the message of an error; names in files may hold what no terminal should get."""
+    text = str(err)
     if isinstance(err, OSError) and not isinstance(err, Semantic2DError) and err.filename:
-        return f"{err.filename}: {(err.strerror or str(err)).lower()}"
-    return str(err)
+        text = f"{err.filename}: {(err.strerror or str(err)).lower()}"
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
 def _print_version(wanted: bool) -> None:  # noqa: FBT001 - typer calls it
@@ -156,54 +158,10 @@ def simulate(
     typer.echo(f"made {out}; look at it with: semantic2d info {out}")
 
 
-@app.command()
-def score(
-    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
-    *,
-    data: Annotated[
-        str | None, typer.Option(help="Data set folder or name; else as the file says.")
-    ] = None,
-    scheme: Annotated[str | None, typer.Option(help="Split scheme; else as it says.")] = None,
-    split: Annotated[str | None, typer.Option(help="Split; else as the file says.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Score predictions: IoU and CA, by class and mean."""
-    from semantic2d_dataset.format.writing import write_text_atomically
-    from semantic2d_dataset.scoring import submission
-    from semantic2d_dataset.scoring.predictions import PredictionsReader
-
-    if out is not None:
-        _check_page(out, predictions)
-    with PredictionsReader(predictions) as reader:
-        name = _dataset_of(reader, data)
-    result = submission.score_predictions(predictions, _open(name), scheme=scheme, split=split)
-    text = submission.result_to_json(result)
-    if out is not None:
-        write_text_atomically(out, text)
-    typer.echo(text if as_json else submission.format_score(result))
-
-
-@app.command()
-def report(
-    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
-    *,
-    data: Annotated[
-        str | None, typer.Option(help="Data set folder or name; else as the file says.")
-    ] = None,
-    scheme: Annotated[str | None, typer.Option(help="Split scheme; else as it says.")] = None,
-    split: Annotated[str | None, typer.Option(help="Split; else as the file says.")] = None,
-    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("report.html"),
-) -> None:
-    """Write an HTML page about predictions."""
-    from semantic2d_dataset.reports import write_report
-    from semantic2d_dataset.scoring.predictions import PredictionsReader
-
-    _check_page(out, predictions)
-    with PredictionsReader(predictions) as reader:
-        name = _dataset_of(reader, data)
-    write_report(out, predictions, _open(name), scheme=scheme, split=split)
-    typer.echo(f"wrote {out}")
+app.command()(score)
+app.command()(report)
+app.command()(compare)
+app.add_typer(submission, name="submission")
 
 
 @app.command()
@@ -244,11 +202,8 @@ def view(
 def run(
     config: Annotated[Path, typer.Argument(help="YAML file: recordings, maps and splits.")],
     *,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes to use.")] = 1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="Dask scheduler (tcp://host:8786) whose workers see the same files."),
-    ] = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
     only: Annotated[
         list[str] | None,
         typer.Option(help="A recording to convert and label; nothing is published then."),
@@ -343,20 +298,6 @@ def _open(name: str) -> OpenDataset:
     from semantic2d_dataset.access.registry import open_dataset
 
     return open_dataset(name)
-
-
-def _check_page(out: Path, source: Path) -> None:
-    """Refuse, before any work, an output that would replace the input or is a folder."""
-    if out.is_dir():
-        raise InvalidInputError(f"{out}: is a folder; give the name of a file")
-    if out.exists() and source.exists() and out.samefile(source):
-        raise InvalidInputError(f"{out}: is the input itself; choose another name")
-
-
-def _dataset_of(reader: PredictionsReader, given: str | None) -> str:
-    if not (given or reader.dataset):
-        raise InvalidInputError(f"{reader.path}: does not name its data set; say it with --data")
-    return given or reader.dataset
 
 
 if __name__ == "__main__":

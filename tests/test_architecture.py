@@ -23,6 +23,7 @@ ROOMS = (
     "plotting",
     "summaries",
     "reports",
+    "comparing",
     "viewing",
     "publishing",
     "pipeline",
@@ -32,6 +33,7 @@ ROOMS = (
     "cli_publishing",
     "cli_splits",
     "cli_table",
+    "cli_submission",
     "cli",
 )
 FILES = [p for package in PACKAGES for p in sorted((PROJECT / package).rglob("*.py"))]

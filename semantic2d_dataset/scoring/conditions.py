@@ -37,7 +37,7 @@ MOVING_CLASS = "Person"
 BANDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "people": ("none in the scan", "in the scan"),
-        "range_m": ("0-1", "1-2", "2-4", "4-8", "8-16", "16 and more"),
+        "range_m": ("0-1", "1-2", "2-4", "4-8", "8-16", "16+"),
         "incidence_deg": ("0-30", "30-60", "60-75", "75-90", "unknown"),
         "border": ("inside", "border"),
         "motion": ("static", "moving"),
@@ -119,6 +119,15 @@ def moving_id(taxonomy: Taxonomy) -> int | None:
         return taxonomy.id_of(MOVING_CLASS)
     except InvalidInputError:
         return None
+
+
+def figure_of(condition: str) -> str:
+    """Return the mean that tells the bands of a condition apart.
+
+    Bands of ``motion`` are chosen by true class: IoU would only count what is taken for classes
+    that a band cannot hold.
+    """
+    return "mCA" if condition == "motion" else "mIoU"
 
 
 def describe_bands(

@@ -70,8 +70,8 @@ def intervals(blocks: Blocks, *, draws: int = DRAWS, seed: int = 0) -> dict[str,
     -------
     dict
         ``level``, ``draws``, ``seed``, number of ``blocks`` and their length ``block_s``;
-        ``mIoU`` and ``mCA``: low and high, fractions; ``iou`` by class. None where a score is
-        missing, or there are fewer than two blocks.
+        ``mIoU`` and ``mCA``: low and high, fractions; in ``classes`` those of each IoU. None
+        where a score is missing, or there are fewer than two blocks.
     """
     drawn = _score_draws(blocks, _weights(len(blocks.windows), draws, seed))
     return _about(blocks, draws, seed) | _by_score(drawn, blocks)
@@ -166,7 +166,7 @@ def _by_score(drawn: Float, blocks: Blocks) -> dict[str, Any]:
 def _named(rows: list[Any], taxonomy: Taxonomy) -> dict[str, Any]:
     count = len(_SCORES)
     means = dict(zip(_SCORES, rows[:count], strict=True))
-    return means | {"iou": dict(zip(taxonomy.names, rows[count:], strict=True))}
+    return means | {"classes": dict(zip(taxonomy.names, rows[count:], strict=True))}
 
 
 def _limits(drawn: Float) -> list[float] | None:

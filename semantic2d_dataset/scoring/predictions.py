@@ -247,7 +247,7 @@ class PredictionsReader:
 
 def metadata_problems(metadata: Any) -> list[str]:
     """List what keeps metadata from fitting ``metadata.schema.json``."""
-    found = jsonschema.Draft202012Validator(_metadata_schema()).iter_errors(metadata)
+    found = jsonschema.Draft202012Validator(metadata_schema()).iter_errors(metadata)
     return [
         f"metadata{_cut(error.json_path.removeprefix('$'))}: {_cut(error.message)}"
         for error in islice(found, _PROBLEMS)
@@ -263,6 +263,7 @@ def _path(sequence_id: str, part: str) -> str:
 
 
 @cache
-def _metadata_schema() -> Any:
+def metadata_schema() -> Any:
+    """Return what metadata must keep to, ``metadata.schema.json``; do not change it."""
     text = resources.files(__package__).joinpath("metadata.schema.json").read_text("utf-8")
     return json.loads(text)

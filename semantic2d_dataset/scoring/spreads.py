@@ -10,6 +10,7 @@ import numpy as np
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scoring.metrics import MEANS, class_names
 
+_FIGURES = ("iou", "ca")
 _TASK = ("dataset", "dataset_version", "scheme", "split", "lidars", "scans", "evaluator_version")
 
 
@@ -24,17 +25,16 @@ def spread(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``count``; for each mean, and by class below ``iou`` and ``ca``, a dict of ``mean`` and
-        ``std`` (of the population, as the published tables have it), fractions; None where no
-        result has the score.
+        ``count``; for each mean, and in ``classes`` for ``iou`` and ``ca`` of each, a dict of
+        ``mean`` and ``std`` (of the population, as the published tables have it), fractions;
+        None where no result has the score.
     """
-    names = class_names(results[0])
     said: dict[str, Any] = {"count": len(results)}
     said |= {mean: _mean_and_std([result[mean] for result in results]) for mean in MEANS}
-    for key in ("iou", "ca"):
-        said[key] = {
-            name: _mean_and_std([result[name][key] for result in results]) for name in names
-        }
+    said["classes"] = {
+        name: {key: _mean_and_std([result[name][key] for result in results]) for key in _FIGURES}
+        for name in class_names(results[0])
+    }
     return said
 
 

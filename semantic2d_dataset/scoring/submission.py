@@ -16,7 +16,7 @@ from semantic2d_dataset.errors import SubmissionError
 from semantic2d_dataset.executors import Executor, Serial
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 from semantic2d_dataset.scoring.calibration import Calibration
-from semantic2d_dataset.scoring.conditions import BANDS, describe_bands
+from semantic2d_dataset.scoring.conditions import BANDS, describe_bands, figure_of
 from semantic2d_dataset.scoring.intervals import blocks_of, intervals
 from semantic2d_dataset.scoring.metrics import EVALUATOR_VERSION, Evaluator, format_table, percent
 from semantic2d_dataset.scoring.predictions import PredictionsReader, PredictionsWriter
@@ -120,7 +120,8 @@ def format_score(result: Mapping[str, Any]) -> str:
         for name, scores in result["per_lidar"].items()
     )
     conditions = (
-        f"{name}: mIoU " + ", ".join(f"{band} {percent(said['mIoU'])}" for band, said in of.items())
+        f"{name}: {figure_of(name)} "
+        + ", ".join(f"{band} {percent(scores[figure_of(name)])}" for band, scores in of.items())
         for name, of in result["conditions"].items()
     )
     return "\n".join(
@@ -140,8 +141,8 @@ def format_score(result: Mapping[str, Any]) -> str:
 
 def format_spread(said: Mapping[str, Any]) -> str:
     """Lay mean and standard deviation out as text, in percent."""
-    width = max(map(len, said["iou"]))
-    rows = {name: (said["iou"][name], said["ca"][name]) for name in said["iou"]}
+    width = max(map(len, said["classes"]))
+    rows = {name: (one["iou"], one["ca"]) for name, one in said["classes"].items()}
     rows["Mean"] = said["mIoU"], said["mCA"]
     lines = (
         f"{name:{width}}  {_plus_minus(iou):>14} {_plus_minus(ca):>14}"

@@ -35,7 +35,7 @@ def test_an_interval_is_that_of_scores_of_resampled_blocks():
     assert said["mIoU"] == pytest.approx(np.quantile(drawn, (0.025, 0.975)).tolist(), abs=1e-12)
     assert said["mIoU"][0] < miou(blocks.confusion.sum(axis=0)) < said["mIoU"][1]
     assert (said["draws"], said["blocks"], said["block_s"]) == (400, 40, 10.0)
-    assert list(said["iou"]) == list(SEMANTIC2D.names)
+    assert list(said["classes"]) == list(SEMANTIC2D.names)
     assert intervals(blocks, draws=400, seed=3) == said
 
 
@@ -56,7 +56,7 @@ def test_one_block_has_no_interval_and_an_absent_class_neither():
     few = make_blocks(0.6, classes=3)
     few.confusion[:, :, 5:] = 0
     few.confusion[:, 5:] = 0
-    assert intervals(few)["iou"]["Wall"] is None
+    assert intervals(few)["classes"]["Wall"] is None
 
 
 def test_a_better_submission_is_told_from_a_worse_one_and_alike_ones_are_not():

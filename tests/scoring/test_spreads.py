@@ -32,8 +32,8 @@ def test_a_spread_is_mean_and_standard_deviation_of_every_score():
     figures = [each["mIoU"] for each in results]
     assert said["mIoU"] == {"mean": np.mean(figures), "std": np.std(figures)}
     figures = [each["Chair"]["ca"] for each in results]
-    assert said["ca"]["Chair"] == {"mean": np.mean(figures), "std": np.std(figures)}
-    assert said["iou"]["Wall"] is None
+    assert said["classes"]["Chair"]["ca"] == {"mean": np.mean(figures), "std": np.std(figures)}
+    assert said["classes"]["Wall"]["iou"] is None
     assert spread(results[:1])["mCA"]["std"] == 0.0
 
 

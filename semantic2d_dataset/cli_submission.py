@@ -1,0 +1,221 @@
+"""The commands about predictions: ``semantic2d score``, ``compare``, ``submission`` and others."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
+from semantic2d_dataset.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from semantic2d_dataset.access.registry import OpenDataset
+
+submission = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None)
+
+Data = Annotated[str | None, typer.Option(help="Data set folder or name; else as the file says.")]
+SchemeName = Annotated[str | None, typer.Option(help="Split scheme; else as the file says.")]
+SplitName = Annotated[str | None, typer.Option(help="Split; else as the file says.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace what exists.")]
+
+
+@submission.callback()
+def _submission() -> None:
+    """Describe a method, check its predictions as the scorer will, and show them."""
+
+
+def score(
+    predictions: Annotated[
+        list[Path], typer.Argument(help="Predictions file, or one for each seed of a method.")
+    ],
+    *,
+    data: Data = None,
+    scheme: SchemeName = None,
+    split: SplitName = None,
+    jobs: Jobs = 1,
+    scheduler: Scheduler = None,
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score predictions: IoU and CA, by class, mean and condition, with intervals.
+
+    Several files are seeds of one method: each is scored, and mean and deviation are printed.
+    """
+    from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.format.writing import write_text_atomically
+    from semantic2d_dataset.scoring import spreads
+    from semantic2d_dataset.scoring import submission as scoring
+
+    _check_out(out, *predictions)
+    found = _open_for(predictions[0], data)
+    with open_executor(jobs=jobs, scheduler=scheduler) as executor:
+        results = [
+            scoring.score_predictions(
+                path.resolve() if scheduler else path,
+                found,
+                scheme=scheme,
+                split=split,
+                executor=executor,
+            )
+            for path in predictions
+        ]
+    said: dict[str, Any] = results[0]
+    if len(results) > 1:
+        said = {"spread": spreads.spread_of_seeds(results), "results": results}
+    text = scoring.result_to_json(said)
+    if out is not None:
+        write_text_atomically(out, text)
+    if as_json:
+        typer.echo(text)
+        return
+    for path, result in zip(predictions, results, strict=True):
+        typer.echo(f"{path}\n" if len(results) > 1 else "", nl=False)
+        typer.echo(scoring.format_score(result))
+    if len(results) > 1:
+        count = len(results)
+        typer.echo(f"\nMean and standard deviation over {count} seeds, percent")
+        typer.echo(scoring.format_spread(said["spread"]))
+
+
+def report(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    *,
+    data: Data = None,
+    scheme: SchemeName = None,
+    split: SplitName = None,
+    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("report.html"),
+) -> None:
+    """Write an HTML page about predictions."""
+    from semantic2d_dataset.reports import write_report
+
+    _check_out(out, predictions)
+    write_report(out, predictions, _open_for(predictions, data), scheme=scheme, split=split)
+    typer.echo(f"wrote {out}")
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Predictions file.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Another one for the same split.")],
+    *,
+    data: Data = None,
+    jobs: Jobs = 1,
+    out: Annotated[Path | None, typer.Option(help="Picture to write.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which of two submissions is better, how surely, and where they differ."""
+    from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.scoring.comparison import compare_predictions, format_comparison
+
+    if out is not None:
+        from semantic2d_dataset.plotting import check_picture_name
+
+        check_picture_name(out)
+    with open_executor(jobs=jobs) as executor:
+        found = compare_predictions(a, b, _open_for(a, data), executor=executor)
+    if out is not None:
+        from semantic2d_dataset.comparing import plot_comparison
+        from semantic2d_dataset.plotting import save
+
+        save(plot_comparison(found), out)
+    typer.echo(json.dumps(found.as_dict(), indent=1) if as_json else format_comparison(found))
+    if out is not None and not as_json:
+        typer.echo(f"wrote {out}")
+
+
+@submission.command()
+def new(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    about: Annotated[Path, typer.Argument(help="YAML file to make, for you to fill in.")],
+    *,
+    force: Force = False,
+) -> None:
+    """Begin the description of a method, with what its predictions say already."""
+    from semantic2d_dataset.format.writing import check_target, write_text_atomically
+    from semantic2d_dataset.scoring.about import write_template
+
+    check_target(about, (predictions,), force=force)
+    write_text_atomically(about, write_template(predictions))
+    typer.echo(f"wrote {about}; fill it in, then: semantic2d submission pack {predictions} {about}")
+
+
+@submission.command()
+def pack(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    about: Annotated[Path, typer.Argument(help="YAML file about the method.")],
+    *,
+    out: Annotated[Path, typer.Option(help="Submission to write.")] = Path("submission.h5"),
+    force: Force = False,
+) -> None:
+    """Put predictions and description into one file."""
+    from semantic2d_dataset.format.writing import check_target
+    from semantic2d_dataset.scoring import about as descriptions
+
+    check_target(out, (predictions, about), force=force)
+    descriptions.pack(predictions, descriptions.read_about(about), out)
+    typer.echo(f"wrote {out}; check it with: semantic2d submission validate {out}")
+
+
+@submission.command()
+def validate(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="Predictions file.")],
+    *,
+    data: Data = None,
+    jobs: Jobs = 1,
+    as_json: AsJson = False,
+) -> None:
+    """List every reason why a file cannot be scored; the scorer asks the same."""
+    from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.scoring import validation
+
+    with open_executor(jobs=jobs) as executor:
+        problems = validation.validate(path, _open_for(path, data), executor=executor)
+    if as_json:
+        typer.echo(json.dumps({"problems": problems}, indent=1))
+    else:
+        for problem in problems:
+            typer.echo(problem)
+        typer.echo(f"{path}: {len(problems) or 'no'} problem(s)")
+    if problems:
+        raise typer.Exit(1)
+
+
+@submission.command()
+def show(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="Predictions file.")],
+    *,
+    as_json: AsJson = False,
+) -> None:
+    """Say what a file holds and what it says of its method."""
+    from semantic2d_dataset.summaries import describe_predictions, format_summary
+
+    said = describe_predictions(path)
+    typer.echo(json.dumps(said, indent=1) if as_json else format_summary(said))
+
+
+def _open_for(predictions: Path, data: str | None) -> OpenDataset:
+    """Open the data set that is given, or else the one that the predictions name."""
+    from semantic2d_dataset.access.registry import open_dataset
+    from semantic2d_dataset.scoring.predictions import PredictionsReader
+
+    with PredictionsReader(predictions) as reader:
+        name = data or reader.dataset
+    if not name:
+        raise InvalidInputError(f"{predictions}: does not name its data set; say it with --data")
+    if data is None and "/" in name:  # a file from elsewhere chooses no folder of this machine
+        raise InvalidInputError(
+            f"{predictions}: names the data set {name!r}, which is a path; say it with --data"
+        )
+    return open_dataset(name)
+
+
+def _check_out(out: Path | None, *sources: Path) -> None:
+    """Refuse, before any work, an output that would replace an input or is a folder."""
+    if out is None:
+        return
+    if out.is_dir():
+        raise InvalidInputError(f"{out}: is a folder; give the name of a file")
+    if out.exists() and any(source.exists() and out.samefile(source) for source in sources):
+        raise InvalidInputError(f"{out}: is the input itself; choose another name")

@@ -1,0 +1,132 @@
+import pytest
+import yaml
+
+from semantic2d_dataset.access.registry import open_dataset
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
+from semantic2d_dataset.scoring.about import pack, read_about, write_template
+from semantic2d_dataset.scoring.predictions import (
+    PredictionsReader,
+    PredictionsWriter,
+    metadata_problems,
+)
+from semantic2d_dataset.scoring.submission import score_predictions
+
+SAID = {
+    "method": "guess",
+    "features": "RIA",
+    "training_data": "generated 1.0.0 block",
+    "parameters": 7,
+    "seeds": [3],
+    "note": "of my own",
+}
+
+
+@pytest.fixture
+def predictions(dataset_folder, tmp_path):
+    data = open_dataset(dataset_folder)
+    with PredictionsWriter(
+        tmp_path / "p.h5",
+        dataset="generated",
+        dataset_version="1.0.0",
+        scheme="block",
+        split="test",
+        taxonomy=SEMANTIC2D,
+        metadata=SAID,
+    ) as writer:
+        for entry in data.manifest.sequences:
+            indices = data.scheme("block").scans_of(entry.id, "test")
+            labels = data.reader(entry.id).read("scans/labels")[indices]
+            writer.add(entry.id, indices, labels % 5)
+    return tmp_path / "p.h5"
+
+
+def test_a_template_holds_what_the_predictions_say(predictions):
+    said = yaml.safe_load(write_template(predictions))
+    assert said == {
+        "method": "guess",
+        "track": {"features": "RIA", "training_data": "generated 1.0.0 block"},
+        "parameters": 7,
+        "seeds": [3],
+        "note": "of my own",
+    }
+
+
+def test_a_template_with_every_comment_taken_away_is_valid(predictions):
+    lines = write_template(predictions).splitlines()
+    kept = [line.removeprefix("# ") for line in lines if ": " in line or line.endswith("track:")]
+    said = yaml.safe_load("\n".join(line for line in kept if not line.startswith("What the")))
+    assert metadata_problems(said) == []
+    assert set(said) >= {"authors", "paper", "code", "track", "hardware", "scans_per_second"}
+    assert set(said["track"]) == {"features", "training_data", "other_data"}
+
+
+def test_packing_changes_the_description_alone(predictions, dataset_folder, tmp_path):
+    about = tmp_path / "about.yaml"
+    about.write_text("method: better\npaper: https://example.org/1\nauthors: [A, B]\n")
+    pack(predictions, read_about(about), tmp_path / "s.h5")
+    data = open_dataset(dataset_folder)
+    before, after = (score_predictions(tmp_path / name, data) for name in ("p.h5", "s.h5"))
+    assert after["submission"]["metadata"]["method"] == "better"
+    for result in (before, after):
+        del result["submission"]
+    assert before == after
+    with PredictionsReader(tmp_path / "s.h5") as reader:
+        assert reader.metadata["authors"] == ["A", "B"]
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ("paper: https://example.org", "'method' is a required property"),
+        ("method: x\npaper: ftp://example.org", "metadata.paper"),
+        ("- method", "metadata: "),
+        ("method: [", "not a YAML file"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_refused(tmp_path, said, message):
+    (tmp_path / "about.yaml").write_text(said)
+    with pytest.raises(InvalidInputError, match=r"about\.yaml") as caught:
+        read_about(tmp_path / "about.yaml")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["https://a.org", "http://a.org:80/x?y=1#z", "https://a.org/~x/"])
+def test_web_addresses_are_accepted(url):
+    assert metadata_problems({"method": "m", "paper": url, "code": url}) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"paper": "javascript:alert(1)"},
+        {"paper": "https://a.org/'onclick='x"},
+        {"code": 'https://a.org/"><script>'},
+        {"code": "https://a.org/ x"},
+        {"code": "https://user@a.org/"},
+        {"paper": "https://a.org/\n"},
+        {"paper": "https://a.org/" + "x" * 500},
+        {"method": "\u202eevil"},
+        {"method": "zero\u200bwidth"},
+        {"method": "two\nlines"},
+        {"method": "x" * 201},
+        {"authors": ["ok", "\x1b]0;x\x07"]},
+        {"authors": ["x"] * 101},
+        {"hardware": "\x00"},
+        {"track": {"features": 3}},
+        {"track": {"unknown": "x"}},
+        {"parameters": 10**16},
+        {"parameters": 1.5},
+        {"scans_per_second": 0},
+        {"seeds": [2**64]},
+        {"deep": {"er": {}}},
+        {"x" * 41: 1},
+        {"\x1b": 1},
+        {"name\n": 1},
+        {f"k{n}": n for n in range(60)},
+    ],
+)
+def test_what_no_page_should_get_is_refused(change):
+    problems = metadata_problems({"method": "m"} | change)
+    assert problems
+    assert all(len(problem) < 700 for problem in problems)

@@ -1,0 +1,128 @@
+import json
+
+import numpy as np
+import pytest
+
+from semantic2d_dataset import cli
+from semantic2d_dataset.access.registry import open_dataset
+from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.executors import Processes
+from semantic2d_dataset.scene.geometry import to_base, to_points, transform
+from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
+from semantic2d_dataset.scoring.comparison import (
+    CELL_M,
+    OUTCOMES,
+    compare_predictions,
+    format_comparison,
+)
+from semantic2d_dataset.scoring.submission import PredictionsWriter, score_predictions
+
+
+@pytest.fixture(scope="module")
+def data(dataset_folder):
+    return open_dataset(dataset_folder)
+
+
+def labels_of(data, name, seed, split="test"):
+    indices = data.scheme("frame").scans_of(name, split)
+    truth = data.reader(name).read("scans/labels")[indices]
+    rng = np.random.default_rng(seed)
+    guess = np.where(rng.random(truth.shape) < 0.1 * (1 + seed), 9, truth)
+    return indices, np.where(guess == 255, 0, guess).astype(np.uint8)
+
+
+def write(path, data, seed, method, split="test"):
+    with PredictionsWriter(
+        path,
+        dataset=str(data.root),
+        dataset_version="1.0.0",
+        scheme="frame",
+        split=split,
+        taxonomy=SEMANTIC2D,
+        metadata={"method": method},
+    ) as writer:
+        for entry in data.manifest.sequences:
+            indices, labels = labels_of(data, entry.id, seed, split)
+            order = np.random.default_rng(seed).permutation(len(indices))
+            writer.add(entry.id, indices[order], labels[order])
+    return path
+
+
+@pytest.fixture(scope="module")
+def pair(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pair")
+    return write(folder / "a.h5", data, 3, "worse"), write(folder / "b.h5", data, 1, "better")
+
+
+@pytest.fixture
+def named(pair, data, tmp_path):
+    """The pair, for a data set by its name, as the manifest has it."""
+    import h5py
+
+    files = []
+    for path in pair:
+        copy = tmp_path / path.name
+        copy.write_bytes(path.read_bytes())
+        with h5py.File(copy, "r+") as file:
+            file.attrs["dataset"] = np.bytes_("generated")
+        files.append(copy)
+    return files
+
+
+def test_outcomes_and_cells_are_those_of_the_points(named, data):
+    found = compare_predictions(*named, data)
+    outcomes = np.zeros(4, int)
+    cells = {}
+    for entry in data.manifest.sequences:
+        batch = data.reader(entry.id).batch()
+        indices, a = labels_of(data, entry.id, 3)
+        _, b = labels_of(data, entry.id, 1)
+        truth, valid = batch.labels[indices], batch.valid[indices]
+        points = to_base(
+            to_points(batch.ranges[indices], batch.lidar.bearings), batch.lidar.base_T_lidar
+        )
+        points = transform(batch.poses[indices], points)
+        for n, k in np.argwhere(valid & (truth != 255)):
+            outcome = 2 * (a[n, k] != truth[n, k]) + (b[n, k] != truth[n, k])
+            outcomes[outcome] += 1
+            cell = (entry.environment, *np.floor(points[n, k] / CELL_M).astype(int).tolist())
+            cells.setdefault(cell, np.zeros(4, int))[outcome] += 1
+    assert found.outcomes == dict(zip(OUTCOMES, outcomes.tolist(), strict=True))
+    for place in found.places:
+        for cell, counts in zip(place.cells.tolist(), place.counts, strict=True):
+            assert (cells.pop((place.environment, *cell)) == counts).all()
+    assert not cells
+
+
+def test_scores_are_those_of_the_two_results(named, data):
+    found = compare_predictions(*named, data)
+    a, b = (score_predictions(path, data) for path in named)
+    for name in ("mIoU", "mCA"):
+        row = found.scores[name]
+        assert row["a"] == pytest.approx(a[name], abs=1e-12)
+        assert row["difference"] == pytest.approx(b[name] - a[name], abs=1e-12)
+    band = found.conditions["range_m"]["4-8"]
+    assert band["b"] == b["conditions"]["range_m"]["4-8"]["mIoU"]
+    assert found.scores["mIoU"]["difference"] > 0
+    with Processes(2) as executor:
+        again = compare_predictions(*named, data, executor=executor)
+    assert json.dumps(again.as_dict()) == json.dumps(found.as_dict())
+    text = format_comparison(found)
+    assert text.startswith("A: worse\nB: better\non generated 1.0.0, split test of frame, small\n")
+
+
+def test_submissions_for_different_scans_are_not_compared(named, data, tmp_path):
+    other = write(tmp_path / "val.h5", data, 2, "other", split="val")
+    with pytest.raises(InvalidInputError, match=r"val\.h5: split val, but test in"):
+        compare_predictions(named[0], other, data)
+
+
+def test_the_command_prints_and_draws(named, data, tmp_path, monkeypatch, capsys):
+    picture = tmp_path / "differences.png"
+    words = ["compare", *map(str, named), "--data", str(data.root), "--out", str(picture)]
+    monkeypatch.setattr("sys.argv", ["semantic2d", *words])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code in (0, None)
+    assert "B: better" in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b"\x89PNG")
