@@ -17,7 +17,14 @@ import typer
 import semantic2d_dataset
 from semantic2d_dataset.cli_data import download, verify
 from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
-from semantic2d_dataset.cli_submission import compare, report, score, submission
+from semantic2d_dataset.cli_submission import (
+    compare,
+    corrupt,
+    report,
+    robustness,
+    score,
+    submission,
+)
 from semantic2d_dataset.cli_table import table
 from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
 from semantic2d_dataset.pipeline.siblings import load_sibling
@@ -161,6 +168,8 @@ def simulate(
 app.command()(score)
 app.command()(report)
 app.command()(compare)
+app.command()(corrupt)
+app.command()(robustness)
 app.add_typer(submission, name="submission")
 
 

@@ -25,6 +25,7 @@ ROOMS = (
     "reports",
     "comparing",
     "viewing",
+    "corruption",
     "publishing",
     "pipeline",
     "loading",
