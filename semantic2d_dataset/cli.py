@@ -17,6 +17,7 @@ import typer
 import semantic2d_dataset
 from semantic2d_dataset.cli_data import download, verify
 from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
+from semantic2d_dataset.cli_splits import splits
 from semantic2d_dataset.cli_submission import (
     compare,
     corrupt,
@@ -124,6 +125,7 @@ def info(
 app.command()(verify)
 app.command()(download)
 app.command()(table)
+app.add_typer(splits, name="splits")
 
 
 @app.command()

@@ -101,7 +101,7 @@ def plot_prediction_beside_truth(
         If labels do not fit the scan.
     """
     both = {"Truth": _labels_of(scan, truth), "Prediction": _labels_of(scan, prediction)}
-    figure = _empty_figure(11.0, 6.0)
+    figure = new_empty_figure(11.0, 6.0)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for ax, (title, labels) in zip(axes, both.items(), strict=True):
         plot_scan(scan, labels, ax=ax, taxonomy=taxonomy)
@@ -174,7 +174,7 @@ def plot_reliability(calibration: Mapping[str, Any]) -> Figure:
     calibration
         As `Calibration.compute` returns it.
     """
-    figure = _empty_figure(11.0, 5.6)
+    figure = new_empty_figure(11.0, 5.6)
     axes = figure.subplots(2, 2, sharex="col", height_ratios=(3, 1))
     reliability, errors = axes.T
     _draw_bins(reliability, calibration["confidence_bins"], "accuracy")
@@ -298,7 +298,7 @@ def save(figure: Figure, path: Path, *, dpi: int = 150) -> None:
     write_bytes_atomically(path, content.getvalue())
 
 
-def _empty_figure(width: float, height: float) -> Figure:
+def new_empty_figure(width: float, height: float) -> Figure:
     """Make a figure of a size in inches, which pyplot, and so any window, never sees."""
     padding = ConstrainedLayoutEngine(h_pad=0.1, w_pad=0.1)  # inches
     figure = Figure((width, height), layout=padding)
@@ -307,7 +307,7 @@ def _empty_figure(width: float, height: float) -> Figure:
 
 
 def _new_figure(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = _empty_figure(width, height)
+    figure = new_empty_figure(width, height)
     return figure, figure.subplots()
 
 
