@@ -28,7 +28,6 @@ from semantic2d_dataset.format.schema import (
     FORMAT_MAJOR,
     MAX_ATTRIBUTE_BYTES,
     MAX_CHUNK_BYTES,
-    MAX_LINKS,
     ArraySpec,
     FileSchema,
 )
@@ -66,6 +65,7 @@ class ContainerReader:
         self.schema = schema
         self._file: Any = None
         self._pid = -1
+        self.groups: list[str] = []
         with self.path.open("rb") as stream:
             found = stream.read(len(_SIGNATURE))
         if found != _SIGNATURE:
@@ -193,8 +193,9 @@ class ContainerReader:
             )
 
     def _check_group(self, group: Any, path: str, found: list[str]) -> None:
-        if group.get_num_objs() > MAX_LINKS:
-            raise UnsafeFileError(f"{self.path}: /{path} holds more than {MAX_LINKS} entries")
+        most = self.schema.max_links
+        if group.get_num_objs() > most:
+            raise UnsafeFileError(f"{self.path}: /{path} holds more than {most} entries")
         for raw in group:
             name = raw.decode("utf-8")
             child = f"{path}/{name}" if path else name
@@ -211,6 +212,7 @@ class ContainerReader:
             found.append(path)
         elif kind == h5py.h5o.TYPE_GROUP and self.schema.is_group(path):
             opened = h5py.h5o.open(group, raw)
+            self.groups.append(path)
             self._check_group(opened, path, found)
         else:
             raise UnsafeFileError(f"{self.path}: /{path} has no place in a {self.schema.kind} file")

@@ -61,12 +61,15 @@ class FileSchema:
         ``str``, ``strs`` (a list), ``int``, ``float``, ``floats`` or ``ints`` (any rank).
     required
         Arrays that must be there.
+    max_links
+        Entries that one group may have.
     """
 
     kind: str
     arrays: Mapping[str, ArraySpec]
     attributes: Mapping[str, Mapping[str, str]]
     required: tuple[str, ...] = ()
+    max_links: int = MAX_LINKS
     groups: frozenset[str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -180,6 +183,7 @@ PREDICTIONS = FileSchema(
             "taxonomy_digest": "str",
         }
     },
+    max_links=5_000,
 )
 
 SCHEMAS = {schema.kind: schema for schema in (SEQUENCE, SPLITS, PREDICTIONS)}

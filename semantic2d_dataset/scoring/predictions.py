@@ -24,7 +24,7 @@ from semantic2d_dataset.scene.taxonomy import Taxonomy
 
 MAX_SAMPLES = 1024
 _MAX_METADATA_BYTES = 1 << 16
-_MAX_BLOCK_BYTES = 1 << 26
+_MAX_BLOCK_BYTES, _MAX_CHUNK_BYTES = 1 << 26, 1 << 24
 _PROBLEMS, _MESSAGE = 50, 300  # of metadata: how many are listed, and how long each is
 
 
@@ -179,8 +179,8 @@ class PredictionsReader:
         self.scheme = str(root.get("scheme", ""))
         self.split = str(root.get("split", ""))
         self.taxonomy_digest = str(root.get("taxonomy_digest", ""))
-        names = (name.split("/") for name in self._container.names)
-        self.sequence_ids = tuple(sorted({parts[1] for parts in names if len(parts) == 3}))
+        paths = (path.split("/") for path in self._container.groups)
+        self.sequence_ids = tuple(sorted(parts[1] for parts in paths if len(parts) == 2))
 
     def __enter__(self) -> Self:
         return self
@@ -222,7 +222,9 @@ class PredictionsReader:
         self, sequence_id: str, part: str, start: int = 0, stop: int | None = None
     ) -> NDArray[Any]:
         """Read rows start to stop of one part of a sequence's predictions."""
-        return self._container.read(_path(sequence_id, part), start, stop)
+        name = _path(sequence_id, part)
+        self._row_bytes(name)
+        return self._container.read(name, start, stop)
 
     def blocks(self, sequence_id: str, part: str) -> Iterator[NDArray[Any]]:
         """Yield one part of a sequence's predictions in runs of whole chunks.
@@ -230,19 +232,32 @@ class PredictionsReader:
         Raises
         ------
         UnsafeFileError
-            If a run would take more than 64 MiB.
+            If a run would take more than 64 MiB, or chunks are larger than they need to be.
         """
         name = _path(sequence_id, part)
-        shape, chunks = self._container.shape(name), self._container.chunks(name)
-        size = (
-            min(chunks[0], shape[0]) * math.prod(shape[1:]) * self._container.dtype(name).itemsize
-        )
-        if size > _MAX_BLOCK_BYTES:
+        row = self._row_bytes(name)
+        held = row * min(self._container.chunks(name)[0], self._container.shape(name)[0])
+        if held > _MAX_BLOCK_BYTES:
             raise UnsafeFileError(
-                f"{self.path}: {name}: its chunks {chunks} make readers hold {size} bytes at once; "
-                f"at most {_MAX_BLOCK_BYTES} are read: store fewer rows in a chunk"
+                f"{self.path}: {name}: its chunks make readers hold {held} bytes at once, and at "
+                f"most {_MAX_BLOCK_BYTES} are read: store fewer rows in a chunk"
             )
         return self._container.blocks(name)
+
+    def _row_bytes(self, name: str) -> int:
+        """Return the bytes of one row, once it is known that its chunks are no larger than needed.
+
+        A small array in large chunks would take long to unpack.
+        """
+        size = self._container.dtype(name).itemsize
+        row = math.prod(self._container.shape(name)[1:]) * size
+        chunk = math.prod(self._container.chunks(name)) * size
+        if chunk > max(_MAX_CHUNK_BYTES, row):
+            raise UnsafeFileError(
+                f"{self.path}: {name}: expected chunks of at most {max(_MAX_CHUNK_BYTES, row)} "
+                f"bytes, found {chunk}"
+            )
+        return row
 
 
 def metadata_problems(metadata: Any) -> list[str]:

@@ -22,7 +22,7 @@ from semantic2d_dataset.scoring.calibration import are_probabilities
 from semantic2d_dataset.scoring.predictions import MAX_SAMPLES, PredictionsReader, metadata_problems
 
 _OPTIONAL = ("probabilities", "samples")
-_LISTED = 1000  # a hostile file could have millions
+_LISTED, _LENGTH = 1000, 500  # problems, and characters of each: a hostile file has millions
 _ROWS = 64
 
 
@@ -149,7 +149,8 @@ def task_of(
 
 def _printable(problems: list[str]) -> list[str]:
     """Make text that comes from a file safe to print, and not too much of it."""
-    kept = ["".join(c if c.isprintable() else "?" for c in line) for line in problems[:_LISTED]]
+    cut = (p if len(p) <= _LENGTH else f"{p[:_LENGTH]} ..." for p in problems[:_LISTED])
+    kept = ["".join(c if c.isprintable() else "?" for c in line) for line in cut]
     left = len(problems) - len(kept)
     return [*kept, f"and {left} more such problems"] if left else kept
 

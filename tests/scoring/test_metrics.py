@@ -29,9 +29,7 @@ def labelled(draw):
     return truth, prediction.astype(np.uint8), valid
 
 
-@settings(deadline=None)
-@given(labelled())
-def test_counts_and_scores_are_those_of_scikit_learn(case):
+def check_against_scikit_learn(case):
     truth, prediction, valid = case
     result = Evaluator().update(truth, prediction, valid).compute()
     scored = (truth != 255) & (True if valid is None else valid)
@@ -49,6 +47,19 @@ def test_counts_and_scores_are_those_of_scikit_learn(case):
         assert result[name]["iou"] == (iou[c] if in_truth or in_prediction else None)
         assert result[name]["ca"] == (recall[c] if in_truth else None)
         assert result[name]["support"] == (t == c).sum()
+
+
+@settings(deadline=None)
+@given(labelled())
+def test_counts_and_scores_are_those_of_scikit_learn(case):
+    check_against_scikit_learn(case)
+
+
+@pytest.mark.long
+@settings(deadline=None, max_examples=1000)
+@given(labelled())
+def test_a_thousand_scores_are_those_of_scikit_learn(case):
+    check_against_scikit_learn(case)
 
 
 @settings(deadline=None)
