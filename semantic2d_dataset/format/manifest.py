@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import datetime
-import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jsonschema
 from tqdm import tqdm
@@ -24,8 +23,14 @@ from semantic2d_dataset.errors import (
     InvalidInputError,
     Semantic2DError,
 )
+from semantic2d_dataset.format.checksums import (
+    CHECKSUMS_NAME,
+    check_checksums,
+    size_and_digest,
+    write_checksums,
+)
 from semantic2d_dataset.format.container import check_version, load_json
-from semantic2d_dataset.format.schema import FORMAT_VERSION
+from semantic2d_dataset.format.schema import FORMAT_MAJOR, FORMAT_VERSION
 from semantic2d_dataset.format.sequence import SequenceReader, slug
 from semantic2d_dataset.format.split_schemes import schemes_of
 from semantic2d_dataset.format.splits import SplitScheme, read_scheme, write_scheme
@@ -33,6 +38,8 @@ from semantic2d_dataset.format.writing import write_text_atomically
 
 MANIFEST_NAME = "dataset.json"
 _KIND = "semantic2d-dataset"
+_MINOR = 1
+"""Manifests with documents are of format 1.1; without any, they are written as 1.0 was."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,8 @@ class Manifest:
         Entries ordered by id.
     splits
         Split files by scheme.
+    documents
+        Files about the data: card, statistics, lists.
     """
 
     name: str
@@ -79,6 +88,7 @@ class Manifest:
     license: str
     sequences: tuple[SequenceEntry, ...]
     splits: Mapping[str, FileEntry]
+    documents: tuple[FileEntry, ...] = ()
 
     @property
     def lengths(self) -> dict[str, int]:
@@ -88,7 +98,7 @@ class Manifest:
     @property
     def files(self) -> tuple[FileEntry, ...]:
         """Every file that the manifest names."""
-        return (*self.sequences, *self.splits.values())
+        return (*self.sequences, *self.splits.values(), *self.documents)
 
 
 @cache
@@ -118,23 +128,40 @@ def read_manifest(folder: Path) -> Manifest:
         raise CorruptFileError(f"{path}: {err}") from err
     if isinstance(said, dict) and isinstance(said.get("format_version"), str):
         check_version(path, said["format_version"])
-    problem = jsonschema.exceptions.best_match(
-        jsonschema.Draft202012Validator(_schema()).iter_errors(said)
-    )
+    problem = jsonschema.exceptions.best_match(_breaches(said))
     if problem is not None:
         raise CorruptFileError(f"{path}: {problem.json_path}: {problem.message}")
-    sequences = tuple(SequenceEntry(**entry) for entry in said["sequences"])
+    sequences = tuple(_entry(SequenceEntry, entry) for entry in said["sequences"])
     if len({entry.id for entry in sequences}) != len(sequences):
         raise CorruptFileError(f"{path}: names a sequence twice")
-    splits = {name: FileEntry(**entry) for name, entry in said["splits"].items()}
-    return Manifest(said["name"], said["version"], said["license"], sequences, splits)
+    splits = {name: _entry(FileEntry, entry) for name, entry in said["splits"].items()}
+    documents = tuple(_entry(FileEntry, entry) for entry in said.get("documents", ()))
+    return Manifest(said["name"], said["version"], said["license"], sequences, splits, documents)
+
+
+def _breaches(said: Any) -> Iterator[Any]:
+    """Yield what breaks the schema; what a newer minor format adds breaks nothing."""
+    version = said.get("format_version") if isinstance(said, dict) else None
+    minor = re.fullmatch(r"[0-9]+\.([0-9]{1,9})", version) if isinstance(version, str) else None
+    is_newer = minor is not None and int(minor[1]) > _MINOR
+    for error in jsonschema.Draft202012Validator(_schema()).iter_errors(said):
+        if not (is_newer and error.validator == "additionalProperties"):
+            yield error
+
+
+_Entry = TypeVar("_Entry", bound=FileEntry)
+
+
+def _entry(kind: type[_Entry], said: Mapping[str, Any]) -> _Entry:
+    return kind(**{each.name: said[each.name] for each in fields(kind)})
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write ``dataset.json`` into a folder."""
+    """Write ``dataset.json`` into a folder, and remove the digests that held it as it was."""
+    documents = [asdict(entry) for entry in manifest.documents]
     said = {
         "format": _KIND,
-        "format_version": FORMAT_VERSION,
+        "format_version": f"{FORMAT_MAJOR}.{_MINOR}" if documents else FORMAT_VERSION,
         "name": manifest.name,
         "version": manifest.version,
         "license": manifest.license,
@@ -142,12 +169,28 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
         "generator": f"semantic2d-dataset {semantic2d_dataset.__version__}",
         "sequences": [asdict(entry) for entry in manifest.sequences],
         "splits": {name: asdict(entry) for name, entry in sorted(manifest.splits.items())},
-    }
+    } | ({"documents": documents} if documents else {})
     try:
         jsonschema.validate(said, _schema())
     except jsonschema.ValidationError as err:
         raise InvalidInputError(f"{folder}: {err.json_path}: {err.message}") from err
+    (Path(folder) / CHECKSUMS_NAME).unlink(missing_ok=True)
     write_text_atomically(Path(folder) / MANIFEST_NAME, json.dumps(said, indent=1) + "\n")
+
+
+def write_digests(folder: Path, manifest: Manifest) -> None:
+    """Write ``SHA256SUMS`` beside a manifest: of it, and of every file that it names."""
+    write_checksums(Path(folder), _digests(Path(folder), manifest))
+
+
+def describe_document(folder: Path, name: str) -> FileEntry:
+    """Return the entry of a file about the data, by its relative name."""
+    return FileEntry(name, *size_and_digest(Path(folder) / name))
+
+
+def _digests(folder: Path, manifest: Manifest) -> dict[str, str]:
+    own = size_and_digest(folder / MANIFEST_NAME)[1]
+    return {MANIFEST_NAME: own} | {entry.file: entry.sha256 for entry in manifest.files}
 
 
 def publish(
@@ -198,7 +241,7 @@ def publish(
     for scheme in schemes_of(stamps) if schemes is None else schemes:
         path = folder / "splits" / f"{scheme.name}.h5"
         write_scheme(path, scheme)
-        splits[scheme.name] = FileEntry(f"splits/{path.name}", *_size_and_digest(path))
+        splits[scheme.name] = FileEntry(f"splits/{path.name}", *size_and_digest(path))
     manifest = Manifest(name, version, license, tuple(entries), splits)
     write_manifest(folder, manifest)
     return manifest
@@ -231,7 +274,7 @@ def _file(path: Path) -> str:
 
 def _describe(path: Path, reader: SequenceReader) -> SequenceEntry:
     header = reader.header
-    size, digest = _size_and_digest(path)
+    size, digest = size_and_digest(path)
     return SequenceEntry(
         file=_file(path),
         bytes=size,
@@ -245,18 +288,12 @@ def _describe(path: Path, reader: SequenceReader) -> SequenceEntry:
     )
 
 
-def _size_and_digest(path: Path) -> tuple[int, str]:
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return path.stat().st_size, digest
-
-
 def find_problems(folder: Path, *, full: bool = False) -> list[Semantic2DError]:
     """Verify a data set and return what is wrong with it, file by file; nothing where all is well.
 
     Every file must exist with its size, open under the format's rules and be what the manifest
-    says of it. With `full`, every byte is hashed, every chunk read and every content digest
-    compared.
+    says of it; ``SHA256SUMS`` must agree, where there is one. With `full`, every byte is hashed,
+    every chunk read and every content digest compared.
 
     Raises
     ------
@@ -272,6 +309,10 @@ def find_problems(folder: Path, *, full: bool = False) -> list[Semantic2DError]:
             _verify(folder, manifest, entry, full=full)
         except Semantic2DError as err:
             problems.append(err)
+    try:
+        check_checksums(folder, _digests(folder, manifest))
+    except ChecksumError as err:
+        problems.append(err)
     return problems
 
 
@@ -280,11 +321,11 @@ def _verify(folder: Path, manifest: Manifest, entry: FileEntry, *, full: bool) -
     if not path.is_file():
         raise DatasetNotFoundError(f"{path}: missing")
     check_size(path, entry)
-    if full and _size_and_digest(path)[1] != entry.sha256:
+    if full and size_and_digest(path)[1] != entry.sha256:
         raise ChecksumError(f"{path}: its SHA-256 is not the one in {MANIFEST_NAME}")
     if not isinstance(entry, SequenceEntry):
-        name = next(name for name, split in manifest.splits.items() if split is entry)
-        read_scheme(path, name, manifest.lengths)
+        for name in (name for name, split in manifest.splits.items() if split is entry):
+            read_scheme(path, name, manifest.lengths)
         return
     with SequenceReader(path) as reader:
         check_sequence(reader, entry)

@@ -10,10 +10,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import jsonschema
-
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.manifest import check_names
+from semantic2d_dataset.format.schema_check import check_document
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.pipeline.siblings import load_sibling
 from semantic2d_dataset.scene.documents import hint, read_yaml
@@ -21,14 +20,6 @@ from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy, read_taxonom
 
 _FILE_OPTIONS = ("poses", "lidar")
 """Options of the conversion that may name a file."""
-
-_KINDS = {
-    "string": "text",
-    "number": "a number",
-    "integer": "a whole number",
-    "object": "a mapping",
-    "array": "a list",
-}
 
 
 @dataclass(frozen=True)
@@ -128,13 +119,7 @@ def read_config(path: Path) -> Config:
     """
     path = Path(path).resolve()
     said = read_yaml(path)
-    problems = sorted(_problems(said))
-    if problems:
-        raise InvalidInputError(
-            f"{path}: {problems[0]}"
-            if len(problems) == 1
-            else f"{path}: {len(problems)} problems\n  - " + "\n  - ".join(problems)
-        )
+    check_document(path, said, _schema())
     try:
         check_names(said["name"], said["version"])
         recordings = tuple(
@@ -162,41 +147,6 @@ def read_config(path: Path) -> Config:
 def _schema() -> Any:
     text = resources.files(__package__).joinpath("config.schema.json").read_text("utf-8")
     return json.loads(text)
-
-
-def _problems(said: Any) -> Iterator[str]:
-    for error in jsonschema.Draft202012Validator(_schema()).iter_errors(said):
-        where = error.json_path.removeprefix("$").removeprefix(".")
-        yield from _in_words(f"{where}: " if where else "", error)
-
-
-def _in_words(where: str, error: Any) -> Iterator[str]:
-    """Say what was expected and what was found."""
-    schema, found = error.schema, error.instance
-    if error.validator == "additionalProperties":
-        known = schema["properties"]
-        for key in found:
-            if key not in known:
-                yield f"{where}unknown key {key!r}{hint(key, known)}"
-    elif error.validator == "required":
-        key = next(key for key in error.validator_value if error.message.startswith(repr(key)))
-        yield f"{where}expected the key {key!r}, which is missing"
-    elif error.validator == "type":
-        quoted = f"; quote it: '{found}'" if error.validator_value == "string" else ""
-        is_plain = isinstance(found, int | float) and not isinstance(found, bool)
-        yield (
-            f"{where}expected {_KINDS[error.validator_value]}, found {found!r}"
-            f"{quoted if is_plain else ''}"
-        )
-    elif error.validator == "pattern":
-        yield (
-            f"{where}expected lower-case letters and digits with single '-', '.' or '_' between "
-            f"them, such as {slug(found)!r}; found {found!r}"
-        )
-    elif error.validator in ("minItems", "minProperties", "minLength"):
-        yield f"{where}is empty"
-    else:
-        yield f"{where}{error.message}"
 
 
 def _recordings(

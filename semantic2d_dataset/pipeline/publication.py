@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,8 @@ from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import Semantic2DError
 from semantic2d_dataset.format.manifest import (
-    MANIFEST_NAME,
     Manifest,
     find_problems,
-    publish,
     read_manifest,
 )
 from semantic2d_dataset.format.sequence import SequenceReader
@@ -28,9 +25,9 @@ from semantic2d_dataset.format.split_schemes import (
 from semantic2d_dataset.format.splits import SplitScheme, read_scheme
 from semantic2d_dataset.pipeline.config import Config
 from semantic2d_dataset.pipeline.drops import without
+from semantic2d_dataset.publishing.staging import stage, swap
 
 WORK = "work"
-SEQUENCES, SPLITS = "sequences", "splits"
 _STAGED, _REMOVED = "staged", "removed"
 
 
@@ -68,10 +65,10 @@ def publish_sequences(
     schemes = [without(scheme, dropped) for scheme in _schemes(config, stamps)]
     if _is_published(config, files, schemes):
         return False
-    staged = config.out / WORK / _STAGED
-    _stage(staged, config, files, schemes)
-    _swap(config.out, staged, {file.name: file for file in files})
-    shutil.rmtree(staged)
+    staged, removed = config.out / WORK / _STAGED, config.out / WORK / _REMOVED
+    said = {"name": config.name, "version": config.version, "license": config.license}
+    stage(staged, files, schemes, **said)
+    swap(config.out, staged, {file.name: file for file in files}, removed=removed)
     return True
 
 
@@ -115,44 +112,3 @@ def _told(folder: Path, manifest: Manifest) -> dict[str, tuple[str, str]]:
 
 def _digest(scheme: SplitScheme) -> tuple[str, str]:
     return scheme.made_by, scheme.digest
-
-
-def _stage(
-    staged: Path, config: Config, files: Sequence[Path], schemes: Sequence[SplitScheme]
-) -> None:
-    """Make splits and manifest beside links to the sequences."""
-    shutil.rmtree(staged, ignore_errors=True)
-    (staged / SEQUENCES).mkdir(parents=True)
-    for file in files:
-        (staged / SEQUENCES / file.name).symlink_to(file)
-    publish(
-        staged,
-        name=config.name,
-        version=config.version,
-        license=config.license,
-        schemes=schemes,
-    )
-
-
-def _swap(out: Path, staged: Path, files: Mapping[str, Path]) -> None:
-    """Put the new data set into the place of the old one.
-
-    Killed in between, there is no manifest and so no data set; every sequence is still at its
-    old place or at its new one, where the next run finds it.
-    """
-    for part in (SEQUENCES, SPLITS):
-        (out / part).mkdir(exist_ok=True)
-    (out / MANIFEST_NAME).unlink(missing_ok=True)
-    splits = {file.name: file for file in (staged / SPLITS).iterdir()}
-    for part, new in ((SEQUENCES, files), (SPLITS, splits)):
-        _set_aside(out / part, new, out / WORK / _REMOVED)
-        for name, file in new.items():
-            file.replace(out / part / name)
-    (staged / MANIFEST_NAME).replace(out / MANIFEST_NAME)
-
-
-def _set_aside(folder: Path, kept: Collection[str], removed: Path) -> None:
-    for file in folder.glob("*.h5"):
-        if file.name not in kept:
-            removed.mkdir(exist_ok=True)
-            file.replace(removed / file.name)

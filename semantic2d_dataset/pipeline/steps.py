@@ -25,9 +25,10 @@ from semantic2d_dataset.format.manifest import read_manifest
 from semantic2d_dataset.pipeline.config import Config, RecordingConfig
 from semantic2d_dataset.pipeline.drops import read_drops
 from semantic2d_dataset.pipeline.labelling import Labelled, find_labelled, label
-from semantic2d_dataset.pipeline.publication import SEQUENCES, WORK, publish_sequences
+from semantic2d_dataset.pipeline.publication import WORK, publish_sequences
 from semantic2d_dataset.pipeline.report import Report, Row
 from semantic2d_dataset.pipeline.siblings import load_sibling
+from semantic2d_dataset.publishing.staging import SEQUENCES
 
 _CONVERTED, _LABELLED = "converted", "labelled"
 _LOCK = ".lock"

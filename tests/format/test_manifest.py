@@ -1,6 +1,8 @@
 import contextlib
 import json
 import shutil
+import subprocess
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -16,7 +18,14 @@ from semantic2d_dataset.errors import (
     InvalidInputError,
     Semantic2DError,
 )
-from semantic2d_dataset.format.manifest import find_problems, publish, read_manifest
+from semantic2d_dataset.format.manifest import (
+    describe_document,
+    find_problems,
+    publish,
+    read_manifest,
+    write_digests,
+    write_manifest,
+)
 from semantic2d_dataset.format.sequence import SequenceReader
 from tests.generators import make_sequence
 
@@ -203,3 +212,75 @@ def test_mutated_manifest_gives_only_our_errors(data, dataset_folder, tmp_path):
     (tmp_path / "dataset.json").write_bytes(text)
     with contextlib.suppress(Semantic2DError):
         read_manifest(tmp_path)
+
+
+@pytest.fixture
+def with_documents(copy):
+    (copy / "splits" / "frame").mkdir()
+    (copy / "splits" / "frame" / "train.txt").write_text("0000000.npy\n")
+    (copy / "CARD.md").write_text("all about it")
+    documents = [describe_document(copy, name) for name in ("CARD.md", "splits/frame/train.txt")]
+    manifest = replace(read_manifest(copy), documents=tuple(documents))
+    write_manifest(copy, manifest)
+    write_digests(copy, manifest)
+    assert read_manifest(copy) == manifest
+    return copy
+
+
+def said_by(folder):
+    return json.loads((folder / "dataset.json").read_text())
+
+
+def test_documents_are_verified_and_make_the_manifest_one_of_a_newer_minor_format(with_documents):
+    assert said_by(with_documents)["format_version"] == "1.1"
+    assert find_problems(with_documents, full=True) == []
+    (with_documents / "CARD.md").write_text("all about I.")
+    assert [type(problem) for problem in find_problems(with_documents, full=True)] == [
+        ChecksumError
+    ]
+    (with_documents / "splits" / "frame" / "train.txt").unlink()
+    assert any("train.txt: missing" in str(each) for each in find_problems(with_documents))
+
+
+def test_a_manifest_without_documents_is_written_as_ever(dataset_folder):
+    assert said_by(dataset_folder)["format_version"] == "1.0"
+    assert "documents" not in said_by(dataset_folder)
+
+
+def test_sha256sum_checks_every_file_but_its_own(with_documents):
+    done = subprocess.run(
+        ["sha256sum", "-c", "SHA256SUMS"], cwd=with_documents, capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    files = {str(p.relative_to(with_documents)) for p in with_documents.rglob("*") if p.is_file()}
+    checked = {line.removesuffix(": OK") for line in done.stdout.splitlines()}
+    assert checked == files - {"SHA256SUMS"}
+
+
+def test_digests_that_list_something_else_are_found_and_a_new_manifest_removes_them(with_documents):
+    sums = with_documents / "SHA256SUMS"
+    sums.write_text(sums.read_text().replace("a", "b", 1))
+    assert any("SHA256SUMS" in str(each) for each in find_problems(with_documents))
+    publish(with_documents, name="generated", version="1.0.1")
+    assert not sums.exists()
+    assert find_problems(with_documents, full=True) == []
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "a/../x", ".x", "a/.x", "dataset.json", "a//b", ""])
+def test_document_that_leads_out_or_is_hidden_is_refused(name, with_documents):
+    said = said_by(with_documents)
+    said["documents"][0]["file"] = name
+    (with_documents / "dataset.json").write_text(json.dumps(said))
+    with pytest.raises(CorruptFileError, match="documents"):
+        read_manifest(with_documents)
+
+
+def test_what_a_newer_minor_manifest_adds_is_passed_over(with_documents):
+    before, said = read_manifest(with_documents), said_by(with_documents)
+    said["mood"] = "good"
+    said["sequences"][0]["weather"] = "fine"
+    (with_documents / "dataset.json").write_text(json.dumps(said))
+    with pytest.raises(CorruptFileError, match="mood|weather"):
+        read_manifest(with_documents)
+    (with_documents / "dataset.json").write_text(json.dumps(said | {"format_version": "1.2"}))
+    assert read_manifest(with_documents) == before
