@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 MINUTES ?= 2
 
-.PHONY: demo test test-long lint setup clean
+.PHONY: card demo test test-long lint setup clean
 
 setup: $(SETUP)
 
@@ -26,6 +26,10 @@ demo: $(SETUP)
 	$(BIN)/semantic2d baseline predict demo/s3net --out demo/predictions.h5
 	$(BIN)/semantic2d score demo/predictions.h5 --out demo/result.json
 	$(BIN)/semantic2d report demo/predictions.h5 --out demo/report.html
+
+# Make DATASET_CARD.md again: it is counted from semantic2d-mini, not typed.
+card: $(SETUP)
+	$(BIN)/semantic2d card semantic2d-mini --out DATASET_CARD.md
 
 test: $(SETUP)
 	$(BIN)/pytest -n 2 -m 'not long'
