@@ -91,3 +91,21 @@ def card(
     else:
         write_text_atomically(out, text)
         typer.echo(f"wrote {out}")
+
+
+def diff(
+    old: Annotated[str, typer.Argument(help="Data set folder or name.")],
+    new: Annotated[str, typer.Argument(help="Data set folder or name.")],
+    *,
+    as_json: AsJson = False,
+) -> None:
+    """Say what changed from one version of a data set to another.
+
+    Sequences, labels (old and new class of each beam), ranges, poses, splits and classes; at the
+    end the version number that the change calls for. Exits 0 whatever differs.
+    """
+    from semantic2d_dataset.access.registry import open_dataset
+    from semantic2d_dataset.publishing.dataset_diff import diff_datasets
+
+    found = diff_datasets(open_dataset(old), open_dataset(new))
+    typer.echo(json.dumps(found.as_dict(), indent=1) if as_json else str(found))
