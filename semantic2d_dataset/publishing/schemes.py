@@ -13,7 +13,8 @@ from semantic2d_dataset.errors import CorruptFileError
 from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.manifest import Manifest
 from semantic2d_dataset.format.schema import SPLITS
-from semantic2d_dataset.format.splits import NONE, TRAIN, SplitScheme, schemes_of
+from semantic2d_dataset.format.split_schemes import schemes_of
+from semantic2d_dataset.format.splits import NONE, TEST, TRAIN, SplitScheme
 
 Members = NDArray[np.uint8]
 Stamps = Mapping[str, NDArray[np.int64]]
@@ -51,9 +52,10 @@ def schemes_for(
     """Return the schemes of a data set: those that exist, and the standard ones that are missing.
 
     Scans keep their split. A sequence that a scheme should know and does not joins it: in
-    ``block`` as the other lidars of its recording, at the same times; in ``environment`` and
-    ``lidar`` as the other sequences of its environment or lidar, else as train; by the rule that
-    the scheme was made by, where it is a standard one; else in no split. Missing standard schemes
+    ``block`` as the other lidars of its recording, at the same times; in ``environment`` as the
+    other sequences of its environment, else as train; in ``lidar`` as its lidar is used, in no
+    split where that is new; by the rule that the scheme was made by, where it is a standard one;
+    else in no split. Missing standard schemes
     are made where the sequences are others than before, or the scheme was there before.
 
     Parameters
@@ -67,8 +69,12 @@ def schemes_for(
     """
     standard = {scheme.name: scheme for scheme in schemes_of(stamps_ns)}
     known = {*before.lengths} if before else set()
+    fresh = {*stamps_ns} - known
+    block = standard["block"]
+    if "block" in existing:
+        block = _extend(existing["block"], stamps_ns, fresh, block, block)
     kept = [
-        _extend(scheme, stamps_ns, {*stamps_ns} - known, standard.get(name))
+        block if name == "block" else _extend(scheme, stamps_ns, fresh, standard.get(name), block)
         for name, scheme in existing.items()
     ]
     is_same = before is not None and {*stamps_ns} == known
@@ -78,7 +84,11 @@ def schemes_for(
 
 
 def _extend(
-    scheme: SplitScheme, stamps_ns: Stamps, fresh: Collection[str], rule: SplitScheme | None
+    scheme: SplitScheme,
+    stamps_ns: Stamps,
+    fresh: Collection[str],
+    rule: SplitScheme | None,
+    block: SplitScheme,
 ) -> SplitScheme:
     old = {
         i: ids
@@ -89,7 +99,7 @@ def _extend(
     new = sorted(({*fresh} - old.keys()) | lost)
     if not new:
         return replace(scheme, membership=old)
-    joined = {i: _members(scheme, old, i, stamps_ns, rule) for i in new}
+    joined = {i: _members(scheme, old, i, stamps_ns, rule, block) for i in new}
     made_by = scheme.made_by.removesuffix(_ADDED) + _ADDED
     return SplitScheme(scheme.name, old | joined, made_by)
 
@@ -100,13 +110,21 @@ def _members(
     sequence_id: str,
     stamps_ns: Stamps,
     rule: SplitScheme | None,
+    block: SplitScheme,
 ) -> Members:
     scans = len(stamps_ns[sequence_id])
     environment, recording, lidar = _parts(sequence_id)
-    if scheme.name in ("environment", "lidar"):
-        index, part = (0, environment) if scheme.name == "environment" else (2, lidar)
-        alike = [ids for i, ids in old.items() if _parts(i)[index] == part]
+    if scheme.name == "environment":
+        alike = [ids for i, ids in old.items() if _parts(i)[0] == environment]
         return np.full(scans, _common(alike), np.uint8)
+    if scheme.name == "lidar":
+        alike = [ids for i, ids in old.items() if _parts(i)[2] == lidar]
+        trains = any((ids == TRAIN).any() for ids in alike)
+        return (
+            _trained(block.membership[sequence_id])
+            if trains
+            else np.full(scans, _common(alike, NONE), np.uint8)
+        )
     if scheme.name == "block":
         together = [i for i in sorted(old) if _parts(i)[:2] == (environment, recording)]
         if together and len(stamps_ns[together[0]]):
@@ -123,10 +141,15 @@ def _parts(sequence_id: str) -> tuple[str, str, str]:
     return environment, recording, lidar
 
 
-def _common(alike: list[Members]) -> int:
-    """Return the split that all of these belong to: train where there are none, else none."""
+def _common(alike: list[Members], otherwise: int = TRAIN) -> int:
+    """Return the split that all of these belong to, if any; `otherwise` where there are none."""
     found = {int(split) for ids in alike for split in np.unique(ids)}
-    return found.pop() if len(found) == 1 else (NONE if found else TRAIN)
+    return found.pop() if len(found) == 1 else (NONE if found else otherwise)
+
+
+def _trained(block: Members) -> Members:
+    """Return what the scheme ``lidar`` makes of a block scheme's members for a train lidar."""
+    return np.where(block == TEST, np.uint8(NONE), block)
 
 
 def _at_the_same_times(

@@ -8,7 +8,8 @@ from semantic2d_dataset import cli
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.format.manifest import publish, read_manifest
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
-from semantic2d_dataset.format.splits import SplitScheme, make_frame_scheme, schemes_of
+from semantic2d_dataset.format.split_schemes import make_frame_scheme, schemes_of
+from semantic2d_dataset.format.splits import SplitScheme
 from semantic2d_dataset.publishing.dataset_diff import diff_datasets
 from tests.publishing.rooms import add, make_rooms
 
