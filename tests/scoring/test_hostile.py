@@ -29,7 +29,7 @@ from tests.scoring.test_submission import (
 )
 
 HUNDRED_MB = 100 << 20
-SHORT, LONG = 160, 1000
+SHORT, LONG = 120, 1000
 """Fuzzed files besides those crafted: some in the ordinary suite, many in the long one."""
 
 _JUDGE = """
