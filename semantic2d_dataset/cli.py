@@ -17,7 +17,7 @@ import typer
 import semantic2d_dataset
 from semantic2d_dataset.cli_data import download, verify
 from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
-from semantic2d_dataset.cli_publishing import card, diff, release
+from semantic2d_dataset.cli_publishing import card, contribute, diff, release
 from semantic2d_dataset.cli_splits import splits
 from semantic2d_dataset.cli_submission import (
     compare,
@@ -130,6 +130,7 @@ app.add_typer(splits, name="splits")
 app.command()(release)
 app.command()(card)
 app.command()(diff)
+app.add_typer(contribute, name="contribute")
 
 
 @app.command()

@@ -109,3 +109,42 @@ def diff(
 
     found = diff_datasets(open_dataset(old), open_dataset(new))
     typer.echo(json.dumps(found.as_dict(), indent=1) if as_json else str(found))
+
+
+contribute = typer.Typer(
+    help="Give recordings to a data set.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+
+@contribute.callback()
+def _contribute() -> None:
+    """Give recordings to a data set."""
+
+
+@contribute.command()
+def check(
+    places: Annotated[
+        list[Path], typer.Argument(metavar="FILE|DIR...", help="Sequences, or folders of them.")
+    ],
+    *,
+    against: Annotated[
+        str | None, typer.Option(help="Data set that they are to join: folder or name.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check sequences: format, licence, names, classes, labels, stamps, poses, leakage.
+
+    Every finding says where, what was found and expected, and what to do. Exits 1 if one of them
+    is an error.
+    """
+    from semantic2d_dataset.access.registry import open_dataset
+    from semantic2d_dataset.publishing.contribution import check_contribution
+
+    data = None if against is None else open_dataset(against)
+    found = check_contribution(places, data)
+    typer.echo(json.dumps(found.as_dict(), indent=1) if as_json else str(found))
+    if found.errors:
+        raise typer.Exit(1)
