@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,7 +35,7 @@ from semantic2d_dataset.access.features import channel_count
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.access.scan_source import ScanSource
 from semantic2d_dataset.access.torch_datasets import load_dataset
-from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, LeakageWarning
 from semantic2d_dataset.executors import open_executor
 from semantic2d_dataset.format.container import load_json
 from semantic2d_dataset.format.writing import write_text_atomically
@@ -281,7 +282,10 @@ def _do(run: _Run) -> RunResult:
     """Train, evaluate, and keep the result."""
     run.folder.mkdir(exist_ok=True)
     write_text_atomically(run.folder / _TASK, json.dumps(run.task, indent=1) + "\n")
-    with _one_thread(), _no_bars() if run.beside > 1 else contextlib.nullcontext():
+    quiet = _no_bars() if run.beside > 1 else contextlib.nullcontext()
+    with _one_thread(), quiet, warnings.catch_warnings():
+        # what is compared with published figures is divided as they were
+        warnings.simplefilter("ignore", LeakageWarning)
         result = _detect(run) if run.spec.model in DETECTORS else _train_and_evaluate(run)
     write_text_atomically(run.folder / _RESULT, json.dumps(asdict(result), indent=1) + "\n")
     return result

@@ -6,11 +6,13 @@ commands of the sibling packages are looked up by name when they are called.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -28,7 +30,7 @@ from semantic2d_dataset.cli_submission import (
     submission,
 )
 from semantic2d_dataset.cli_table import table
-from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
+from semantic2d_dataset.errors import InvalidInputError, LeakageWarning, Semantic2DError
 from semantic2d_dataset.pipeline.siblings import load_sibling
 
 if TYPE_CHECKING:
@@ -59,7 +61,8 @@ def main() -> None:
     """Run the command line: 0 done, 1 bad input, 2 wrong usage, 130 interrupted."""
     debug = "--debug" in sys.argv
     try:
-        app(args=[word for word in sys.argv[1:] if word != "--debug"])
+        with _leaks_in_words():
+            app(args=[word for word in sys.argv[1:] if word != "--debug"])
     except (Semantic2DError, OSError) as err:
         if debug:
             raise
@@ -78,6 +81,24 @@ def main() -> None:
             raise
         sys.stderr.write("interrupted; nothing half done was left\n")
         sys.exit(_INTERRUPTED)
+
+
+@contextlib.contextmanager
+def _leaks_in_words() -> Iterator[None]:
+    """Show the warning about leaks as a line, without the code that gave it."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def show_in_words(
+            message: Warning | str, category: type[Warning], *where: Any, **more: Any
+        ) -> None:
+            if issubclass(category, LeakageWarning):
+                sys.stderr.write(f"warning: {message}\n")
+            else:
+                show(message, category, *where, **more)
+
+        warnings.showwarning = show_in_words
+        yield
 
 
 def _message(err: Exception) -> str:

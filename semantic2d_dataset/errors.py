@@ -19,6 +19,9 @@
         └── WriteError (OSError)                       a file could not be written
 
 ``FileNotFoundError`` and ``PermissionError`` of single files pass through as they are.
+
+There is one warning, which stops nothing: ``LeakageWarning`` (UserWarning), about training on a
+split whose test scans are as good as trained on.
 """
 
 from __future__ import annotations
@@ -111,6 +114,10 @@ class SubmissionError(Semantic2DError, ValueError):
 
 class WorkerLostError(Semantic2DError):
     """A process of this machine, or a worker of a cluster, died with what it was working on."""
+
+
+class LeakageWarning(UserWarning):
+    """Test scans of a split lie next to train scans, so that scores say little of new scans."""
 
 
 class WriteError(Semantic2DError, OSError):

@@ -85,6 +85,18 @@ class OpenDataset:
         check_size(path, entry)
         return read_scheme(path, name, self.manifest.lengths)
 
+    def lidars_of(self, scheme: str, split: str) -> list[str]:
+        """Return the names of the lidars that have scans in a split.
+
+        Raises
+        ------
+        InvalidInputError
+            If the data set has no such scheme, or there is no such split.
+        """
+        found = self.scheme(scheme)
+        taken = {i for i in found.membership if found.scans_of(i, split).size}
+        return sorted({entry.lidar for entry in self.manifest.sequences if entry.id in taken})
+
     def reader(self, sequence_id: str) -> SequenceReader:
         """Open a sequence by its id.
 

@@ -199,9 +199,11 @@ class ScanSource:
         self._all_rows = np.concatenate(self._rows)
         self._starts = np.cumsum([0, *map(len, self._rows)]).tolist()
         if not len(self):
+            others = ", ".join(self.data.lidars_of(self.scheme, split)) if split else ""
             raise DatasetNotFoundError(
                 f"{self.data.manifest.name}: {self.lidar.name} has no scan in the split "
                 f"{split!r} of the scheme {self.scheme!r}"
+                + (f"; that split has scans of {others}" if others else "")
             )
         sequences = np.repeat(np.arange(len(self._rows)), [len(rows) for rows in self._rows])
         self._keys = sequences * _MAX_ROWS + self._all_rows

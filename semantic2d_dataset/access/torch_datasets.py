@@ -19,11 +19,12 @@ from semantic2d_dataset.access.features import (
     targets_of,
 )
 from semantic2d_dataset.access.histories import History, PastScans
+from semantic2d_dataset.access.leak_warnings import warn_of_leaks
 from semantic2d_dataset.access.registry import OpenDataset, open_dataset
 from semantic2d_dataset.access.scan_source import Fields, ScanSource
 from semantic2d_dataset.access.torch_batches import Batch, BatchedDataset
 from semantic2d_dataset.access.transforms import Transform
-from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
 from semantic2d_dataset.scene.geometry import incidence_angles
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW, RPLIDAR_S2, WLR_716, LidarSpec
 from semantic2d_dataset.scene.taxonomy import Taxonomy
@@ -102,6 +103,8 @@ class LidarDataset(BatchedDataset):
         if name is None:
             raise InvalidInputError("say which lidar, such as lidar='hokuyo'")
         self.features = None if features is None else normalise_features(features)
+        if split == "train":
+            warn_of_leaks(data, scheme)
         self.transform, self.transform_seed = transform, transform_seed
         self._buffers = Buffers()
         if history is not None and transform is not None:
@@ -266,7 +269,18 @@ class RPLidarS2(LidarDataset):
 
 
 def _train_part(source: ScanSource) -> ScanSource:
-    return source if source.split == "train" else source.of_split("train")
+    if source.split == "train":
+        return source
+    try:
+        return source.of_split("train")
+    except DatasetNotFoundError as err:
+        trained = " or ".join(map(repr, source.data.lidars_of(source.scheme, "train")))
+        raise InvalidInputError(
+            f"{source.data.manifest.name}: the scheme {source.scheme!r} has no train scan of "
+            f"{source.lidar.name} to standardise its features by; load the scans that the model "
+            f"is trained on (split='train', lidar={trained}), and give their statistics here: "
+            "statistics=train.statistics"
+        ) from err
 
 
 _CLASSES = {

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from semantic2d_dataset.format.manifest import Manifest, check_sequence, check_size
 from semantic2d_dataset.format.sequence import SequenceReader
-from semantic2d_dataset.format.splits import NONE, TRAIN, SplitScheme, split_id
+from semantic2d_dataset.format.splits import NONE, TRAIN, SplitScheme, is_next_to, split_id
 
 NEAR_S = 1.0
 NEAR_M, NEAR_RAD = 0.25, math.radians(15)
@@ -272,9 +272,8 @@ def _measure(
     places: _Places,
 ) -> Nearness:
     chosen = ids == wanted
-    is_train = np.pad(ids == TRAIN, 1)
-    next_to = (is_train[:-2] | is_train[2:])[chosen]
-    trained_on = np.full(len(next_to), is_train.any())
+    next_to = is_next_to(ids == TRAIN)[chosen]
+    trained_on = np.full(len(next_to), (ids == TRAIN).any())
     time_s = _nearest_s(track.stamps_ns[chosen], train_ns)
     return Nearness(next_to, trained_on, time_s, *places.nearest(track.poses[chosen]))
 

@@ -59,6 +59,15 @@ class SplitScheme:
             raise InvalidInputError(f"scheme {self.name} does not cover {sequence_id}")
         return np.flatnonzero(self.membership[sequence_id] == wanted)
 
+    def neighbour_share(self, split: str) -> float:
+        """Return the share of the scans of a split before or after which a train scan lies."""
+        next_to = [
+            is_next_to(ids == TRAIN)[self.scans_of(name, split)]
+            for name, ids in self.membership.items()
+        ]
+        found = np.concatenate([np.zeros(0, np.bool_), *next_to])
+        return float(found.mean()) if found.size else 0.0
+
     @property
     def sizes(self) -> dict[str, int]:
         """Number of scans of train, val and test, and of those in none."""
@@ -76,6 +85,13 @@ class SplitScheme:
         for sequence_id in sorted(self.membership):
             digest.update(sequence_id.encode() + b"\0" + self.membership[sequence_id].tobytes())
         return digest.hexdigest()
+
+
+def is_next_to(these: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell (N,) whether the scan before or after a scan is one of these."""
+    padded = np.pad(these, 1)
+    neighbours: NDArray[np.bool_] = padded[:-2] | padded[2:]
+    return neighbours
 
 
 def split_id(split: str) -> int:

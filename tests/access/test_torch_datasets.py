@@ -1,5 +1,6 @@
 import hashlib
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -184,3 +185,27 @@ def test_unknown_options_say_what_there_is(options, error, says, folder):
 def test_dataset_without_lidar_is_refused(folder):
     with pytest.raises(InvalidInputError, match="say which lidar"):
         LidarDataset(open_dataset(folder))
+
+
+def test_lidar_without_train_scans_says_whose_statistics_to_give(tmp_path):
+    other = replace(SMALL_LIDAR, name="other")
+    make_dataset(tmp_path, environments=("lobby",), lidars=(SMALL_LIDAR, other), scans=200)
+    options = {"scheme": "lidar", "features": "RIA"}
+    tested, *trained = sorted(
+        ("small", "other"),
+        key=lambda name: name not in open_dataset(tmp_path).lidars_of("lidar", "test"),
+    )
+    with pytest.raises(InvalidInputError) as told:
+        load_dataset(tmp_path, lidar=tested, split="test", **options)
+    assert str(told.value) == (
+        f"generated: the scheme 'lidar' has no train scan of {tested} to standardise its features "
+        f"by; load the scans that the model is trained on (split='train', lidar='{trained[0]}'), "
+        "and give their statistics here: statistics=train.statistics"
+    )
+    train = load_dataset(tmp_path, lidar=trained[0], **options)
+    test = load_dataset(
+        tmp_path, lidar=tested, split="test", statistics=train.statistics, **options
+    )
+    assert (len(test), test.statistics) == (200, train.statistics)
+    with pytest.raises(DatasetNotFoundError, match=f"that split has scans of {trained[0]}"):
+        load_dataset(tmp_path, lidar=tested, split="train", **options)
