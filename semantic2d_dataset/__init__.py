@@ -6,8 +6,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from semantic2d_dataset.access.dask_arrays import dask_arrays
     from semantic2d_dataset.access.features import Statistics
+    from semantic2d_dataset.access.histories import History
     from semantic2d_dataset.access.registry import OpenDataset, open_dataset
+    from semantic2d_dataset.access.scan_tables import scan_table
     from semantic2d_dataset.access.torch_datasets import (
         WLR716,
         HokuyoUTM30LXEW,
@@ -15,6 +18,8 @@ if TYPE_CHECKING:
         RPLidarS2,
         load_dataset,
     )
+    from semantic2d_dataset.access.torch_lidars import load_lidars
+    from semantic2d_dataset.access.torch_samplers import Shard
     from semantic2d_dataset.errors import Semantic2DError
     from semantic2d_dataset.format.manifest import Manifest, publish, read_manifest
     from semantic2d_dataset.format.sequence import (
@@ -35,6 +40,7 @@ __version__ = "0.1.0"
 # Names load when they are first used: neither torch nor numba slows an import down.
 _HOMES = {
     "Evaluator": "scoring.metrics",
+    "History": "access.histories",
     "HokuyoUTM30LXEW": "access.torch_datasets",
     "LidarDataset": "access.torch_datasets",
     "LidarSpec": "scene.lidars",
@@ -49,19 +55,24 @@ _HOMES = {
     "SequenceHeader": "format.sequence",
     "SequenceReader": "format.sequence",
     "SequenceWriter": "format.sequence",
+    "Shard": "access.torch_samplers",
     "SplitScheme": "format.splits",
     "Statistics": "access.features",
     "Taxonomy": "scene.taxonomy",
     "WLR716": "access.torch_datasets",
+    "dask_arrays": "access.dask_arrays",
     "load_dataset": "access.torch_datasets",
+    "load_lidars": "access.torch_lidars",
     "open_dataset": "access.registry",
     "publish": "format.manifest",
     "read_manifest": "format.manifest",
+    "scan_table": "access.scan_tables",
 }
 
 __all__ = [
     "WLR716",
     "Evaluator",
+    "History",
     "HokuyoUTM30LXEW",
     "LidarDataset",
     "LidarSpec",
@@ -76,13 +87,17 @@ __all__ = [
     "SequenceHeader",
     "SequenceReader",
     "SequenceWriter",
+    "Shard",
     "SplitScheme",
     "Statistics",
     "Taxonomy",
+    "dask_arrays",
     "load_dataset",
+    "load_lidars",
     "open_dataset",
     "publish",
     "read_manifest",
+    "scan_table",
 ]
 
 

@@ -143,6 +143,7 @@ def test_input_is_not_checked_with_assert(path):
 def test_public_names_are_pinned():
     assert sorted(semantic2d_dataset.__all__) == [
         "Evaluator",
+        "History",
         "HokuyoUTM30LXEW",
         "LidarDataset",
         "LidarSpec",
@@ -157,14 +158,18 @@ def test_public_names_are_pinned():
         "SequenceHeader",
         "SequenceReader",
         "SequenceWriter",
+        "Shard",
         "SplitScheme",
         "Statistics",
         "Taxonomy",
         "WLR716",
+        "dask_arrays",
         "load_dataset",
+        "load_lidars",
         "open_dataset",
         "publish",
         "read_manifest",
+        "scan_table",
     ]
 
 

@@ -10,6 +10,8 @@ from torch.utils.data import DataLoader
 import semantic2d_dataset
 from semantic2d_dataset import HokuyoUTM30LXEW, LidarDataset, load_dataset, open_dataset
 from semantic2d_dataset.access.features import Statistics
+from semantic2d_dataset.access.histories import History
+from semantic2d_dataset.access.torch_samplers import Shard
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
 from semantic2d_dataset.scene.geometry import incidence_angles
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW
@@ -76,7 +78,8 @@ def test_plain_loader_and_own_loader_deliver_the_same(folder, in_memory):
 
 
 def digest_of(batch, i):
-    parts = [batch[key][i].numpy().tobytes() for key in ("features", "label", "valid")]
+    arrays = sorted(key for key in batch if key != "scan_id")
+    parts = [batch[key][i].numpy().tobytes() for key in arrays]
     return batch["scan_id"][i], hashlib.sha256(b"".join(parts)).hexdigest()
 
 
@@ -84,19 +87,24 @@ def digests_of(loader):
     return [digest_of(batch, i) for batch in loader for i in range(len(batch["scan_id"]))]
 
 
-def check_workers(folder, method, workers, in_memory):
-    dataset = load(folder, features="RIA", in_memory=in_memory)
+def check_workers(folder, method, workers, *, in_memory, history=None, team=1):
+    """Compare two epochs of every process of a team with what one process delivers in order."""
+    dataset = load(folder, features="RIA", in_memory=in_memory, history=history)
     expected = Counter(digests_of(dataset.loader(50)))
-    loader = dataset.loader(
-        16,
-        shuffle=True,
-        num_workers=workers,
-        multiprocessing_context=method,
-        persistent_workers=True,
-    )
+    loaders = [
+        dataset.loader(
+            16,
+            shuffle=True,
+            shard=Shard(rank, team, "keep"),
+            num_workers=workers,
+            multiprocessing_context=method,
+            persistent_workers=True,
+        )
+        for rank in range(team)
+    ]
     orders = []
     for _ in range(2):
-        found = digests_of(loader)
+        found = [digest for loader in loaders for digest in digests_of(loader)]
         assert Counter(found) == expected
         orders.append([scan_id for scan_id, _ in found])
     assert orders[0] != orders[1]
@@ -105,15 +113,27 @@ def check_workers(folder, method, workers, in_memory):
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_workers_deliver_every_item_once_and_right(folder, method):
-    check_workers(folder, method, 2, in_memory=method == "fork")
+    fork = method == "fork"
+    history = None if fork else History(2, compensate="points", across_splits=True)
+    check_workers(folder, method, 2, in_memory=fork, history=history, team=2 if fork else 1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("in_memory", "history"),
+    [(True, None), (False, History(3, compensate="ranges", across_splits=True))],
+)
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+def test_sixteen_workers_deliver_every_item_once_and_right(folder, method, in_memory, history):
+    check_workers(folder, method, 16, in_memory=in_memory, history=history)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("in_memory", [True, False])
-@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
-def test_sixteen_workers_deliver_every_item_once_and_right(folder, method, in_memory):
-    check_workers(folder, method, 16, in_memory=in_memory)
+def test_a_team_of_four_with_sixteen_workers_delivers_every_item_once(folder, in_memory):
+    check_workers(folder, "fork", 4, in_memory=in_memory, team=4)
 
 
 def test_batches_that_are_kept_are_never_overwritten(folder):
