@@ -119,7 +119,8 @@ def test_two_processes_train_one_model(tmp_path: Path):
 def test_a_team_refuses_a_time_limit(tmp_path: Path):
     done = run_two(TIMED, tmp_path)
     assert all(process.returncode for process in done)
-    assert "2 processes cannot keep one time limit" in done[0].stderr
+    # the first to refuse is gone, perhaps before the other has found it
+    assert any("2 processes cannot keep one time limit" in each.stderr for each in done)
 
 
 @pytest.mark.parametrize(("scans", "batch_size"), [(2, 8), (8, 2)])
