@@ -14,7 +14,7 @@ from typing import Any
 import jsonschema
 
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
-from semantic2d_dataset.format.container import check_version, load_json
+from semantic2d_dataset.format.container import check_version, load_json, newer_minor_hint
 from semantic2d_dataset.scene.documents import hint
 
 REGISTRY_VARIABLE = "SEMANTIC2D_REGISTRY"
@@ -166,7 +166,8 @@ def _read(path: Path, text: bytes) -> list[KnownDataset]:
         jsonschema.Draft202012Validator(_schema()).iter_errors(said)
     )
     if problem is not None:
-        raise InvalidInputError(f"{path}: {problem.json_path}: {problem.message}")
+        newer = newer_minor_hint(said.get("format_version")) if isinstance(said, dict) else ""
+        raise InvalidInputError(f"{path}: {problem.json_path}: {problem.message}{newer}")
     found = [
         KnownDataset(**entry | {"sources": tuple(map(_source, entry["sources"]))})
         for entry in said["datasets"]

@@ -26,6 +26,8 @@ from semantic2d_dataset.errors import (
 )
 from semantic2d_dataset.format.schema import (
     FORMAT_MAJOR,
+    FORMAT_MINOR,
+    FORMAT_VERSION,
     MAX_ATTRIBUTE_BYTES,
     MAX_CHUNK_BYTES,
     ArraySpec,
@@ -66,6 +68,7 @@ class ContainerReader:
         self._file: Any = None
         self._pid = -1
         self.groups: list[str] = []
+        self._hint = ""
         with self.path.open("rb") as stream:
             found = stream.read(len(_SIGNATURE))
         if found != _SIGNATURE:
@@ -176,7 +179,9 @@ class ContainerReader:
     def _check(self) -> list[str]:
         root = self._handle().id
         self._check_kind(_text_attribute(root, "format"))
-        check_version(self.path, _text_attribute(root, "format_version"))
+        version = _text_attribute(root, "format_version")
+        check_version(self.path, version)
+        self._hint = newer_minor_hint(version)
         found: list[str] = []
         self._check_attributes(root, "")
         self._check_group(root, "", found)
@@ -215,7 +220,9 @@ class ContainerReader:
             self.groups.append(path)
             self._check_group(opened, path, found)
         else:
-            raise UnsafeFileError(f"{self.path}: /{path} has no place in a {self.schema.kind} file")
+            raise UnsafeFileError(
+                f"{self.path}: /{path} has no place in a {self.schema.kind} file{self._hint}"
+            )
         self._check_attributes(opened, path)
 
     def _check_array(self, array: Any, path: str, spec: ArraySpec) -> None:
@@ -250,7 +257,9 @@ class ContainerReader:
             name = attribute.name.decode("utf-8", "replace")
             where = f"{self.path}: attribute {name!r} of /{path}"
             if name not in allowed:
-                raise UnsafeFileError(f"{where} has no place in a {self.schema.kind} file")
+                raise UnsafeFileError(
+                    f"{where} has no place in a {self.schema.kind} file{self._hint}"
+                )
             if attribute.dtype.kind != {"s": "S", "i": "i", "f": "f"}[allowed[name][0]]:
                 raise UnsafeFileError(f"{where}: expected {allowed[name]}, found {attribute.dtype}")
             if _bytes_of(attribute.shape, attribute.dtype) > MAX_ATTRIBUTE_BYTES:
@@ -335,3 +344,14 @@ def check_version(path: Path, version: str) -> None:
             f"{path}: written in format {version}, and this package reads up to "
             f"{FORMAT_MAJOR}.x; install semantic2d-dataset {major}.0 or later"
         )
+
+
+def newer_minor_hint(version: object) -> str:
+    """Return the end of a message about what is unknown here, where a newer format explains it."""
+    found = re.fullmatch(rf"{FORMAT_MAJOR}\.([0-9]{{1,9}})", str(version))
+    if found is None or int(found[1]) <= FORMAT_MINOR:
+        return ""
+    return (
+        f"; the file is of format {version}, and this package knows {FORMAT_VERSION}: "
+        "install a newer semantic2d-dataset"
+    )

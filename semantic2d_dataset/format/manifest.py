@@ -30,7 +30,7 @@ from semantic2d_dataset.format.checksums import (
     write_checksums,
 )
 from semantic2d_dataset.format.container import check_version, load_json
-from semantic2d_dataset.format.schema import FORMAT_MAJOR, FORMAT_VERSION
+from semantic2d_dataset.format.schema import FORMAT_MINOR, FORMAT_VERSION
 from semantic2d_dataset.format.sequence import SequenceReader, slug
 from semantic2d_dataset.format.split_schemes import schemes_of
 from semantic2d_dataset.format.splits import SplitScheme, read_scheme, write_scheme
@@ -38,8 +38,6 @@ from semantic2d_dataset.format.writing import write_text_atomically
 
 MANIFEST_NAME = "dataset.json"
 _KIND = "semantic2d-dataset"
-_MINOR = 1
-"""Manifests with documents are of format 1.1; without any, they are written as 1.0 was."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ def _breaches(said: Any) -> Iterator[Any]:
     """Yield what breaks the schema; what a newer minor format adds breaks nothing."""
     version = said.get("format_version") if isinstance(said, dict) else None
     minor = re.fullmatch(r"[0-9]+\.([0-9]{1,9})", version) if isinstance(version, str) else None
-    is_newer = minor is not None and int(minor[1]) > _MINOR
+    is_newer = minor is not None and int(minor[1]) > FORMAT_MINOR
     for error in jsonschema.Draft202012Validator(_schema()).iter_errors(said):
         if not (is_newer and error.validator == "additionalProperties"):
             yield error
@@ -161,7 +159,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     documents = [asdict(entry) for entry in manifest.documents]
     said = {
         "format": _KIND,
-        "format_version": f"{FORMAT_MAJOR}.{_MINOR}" if documents else FORMAT_VERSION,
+        "format_version": FORMAT_VERSION,
         "name": manifest.name,
         "version": manifest.version,
         "license": manifest.license,
