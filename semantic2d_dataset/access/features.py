@@ -144,7 +144,7 @@ def features_of(
         _limits_of(lidar),
         (np.float32(step[0]), np.float32(step[1])),
     )
-    _share(lambda part: _fill(*inputs, picked[part], out[part]), len(picked))
+    share_rows(lambda part: _fill(*inputs, picked[part], out[part]), len(picked))
     return out
 
 
@@ -178,14 +178,14 @@ def targets_of(
     found = source.take((len(rows), lidar.beams), np.int64)
     valid = source.take((len(rows), lidar.beams), np.bool_)
     limits = _limits_of(lidar)
-    _share(
+    share_rows(
         lambda part: _gather(ranges, labels, limits, rows[part], found[part], valid[part]),
         len(rows),
     )
     return found, valid
 
 
-def _share(work: Callable[[slice], None], count: int) -> None:
+def share_rows(work: Callable[[slice], None], count: int) -> None:
     """Run work on the rows of a batch, in two threads where they are many.
 
     A loader's worker has one core. Threads of OpenMP, which `numba.prange` starts, would stall

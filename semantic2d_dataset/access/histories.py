@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic2d_dataset.access.bearings import level_mount
+from semantic2d_dataset.access.features import share_rows
 from semantic2d_dataset.access.scan_source import ScanSource
 from semantic2d_dataset.errors import InvalidInputError
-from semantic2d_dataset.scene.geometry import compose, invert
+from semantic2d_dataset.scene.geometry import arctan_quadrant, compose, invert
 from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import UNLABELLED
 
@@ -164,8 +165,9 @@ class PastScans:
         seen, beams = see_again(ranges, lidar, turn, shift)
         found = arrays | {"ranges": np.where(valid[..., None], seen, np.float32(np.nan))}
         for name in {"intensities", "labels"} & set(arrays):
-            moved = np.take_along_axis(arrays[name], np.maximum(beams, 0), axis=-1)
-            found[name] = np.where(beams >= 0, moved, moved.dtype.type(_FILL[name]))
+            found[name] = np.full_like(arrays[name], _FILL[name])
+            values, picked = (each.reshape(-1, lidar.beams) for each in (arrays[name], found[name]))
+            _pick(values, beams.reshape(-1, lidar.beams), picked)
         return found
 
 
@@ -198,16 +200,18 @@ def see_again(
     shape = ranges.shape
     seen = np.full(shape, np.inf, np.float32)
     beams = np.full(shape, -1, np.int64)
-    _see_again(
-        np.ascontiguousarray(ranges).reshape(-1, lidar.beams),
-        _directions(lidar),
-        np.ascontiguousarray(turn).reshape(-1, 2, 2),
-        np.ascontiguousarray(shift).reshape(-1, 2),
-        (lidar.range_min, lidar.range_max),
-        (lidar.angle_min, lidar.angle_increment),
-        seen.reshape(-1, lidar.beams),
-        beams.reshape(-1, lidar.beams),
-    )
+    rows = np.ascontiguousarray(ranges).reshape(-1, lidar.beams)
+    turns = np.ascontiguousarray(turn).reshape(-1, 2, 2)
+    shifts = np.ascontiguousarray(shift).reshape(-1, 2)
+    outs = seen.reshape(rows.shape), beams.reshape(rows.shape)
+    limits, angles = (lidar.range_min, lidar.range_max), (lidar.angle_min, lidar.angle_increment)
+    directions = _directions(lidar)
+
+    def work(part: slice) -> None:
+        a, b = outs[0][part], outs[1][part]
+        _see_again(rows[part], turns[part], shifts[part], a, b, directions, limits, angles)
+
+    share_rows(work, len(rows))
     return seen, beams
 
 
@@ -241,13 +245,13 @@ def _lidar_motion(
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def _see_again(
     ranges: NDArray[np.float32],
-    directions: NDArray[np.float64],
     turn: NDArray[np.float64],
     shift: NDArray[np.float64],
-    limits: tuple[float, float],
-    angles: tuple[float, float],
     seen: NDArray[np.float32],
     beams: NDArray[np.int64],
+    directions: NDArray[np.float64],
+    limits: tuple[float, float],
+    angles: tuple[float, float],
 ) -> None:
     count, circle = ranges.shape[1], 2 * np.pi / angles[1]
     for n in range(len(ranges)):
@@ -259,10 +263,23 @@ def _see_again(
             x, y = r * directions[k, 0], r * directions[k, 1]
             u = a[0, 0] * x + a[0, 1] * y + t[0]
             v = a[1, 0] * x + a[1, 1] * y + t[1]
-            position = (np.arctan2(v, u) - angles[0]) / angles[1]
+            distance = np.float32(np.sqrt(u * u + v * v))
+            if not (distance > 0 and distance >= limits[0] and distance < limits[1]):
+                continue
+            bearing = float(arctan_quadrant(np.float32(abs(v)), np.float32(abs(u))))
+            bearing = np.pi - bearing if u < 0 else bearing
+            position = ((-bearing if v < 0 else bearing) - angles[0]) / angles[1]
             position -= np.floor((position + 0.5) / circle) * circle
-            beam, distance = int(np.rint(position)), np.float32(np.hypot(u, v))
-            while beam < count and distance >= limits[0] and distance < limits[1]:
+            beam = int(position + 0.5)
+            while beam < count:
                 if distance < seen[n, beam]:
                     seen[n, beam], beams[n, beam] = distance, k
                 beam += int(np.rint(circle))  # the last beam may look where the first one does
+
+
+@numba.njit(cache=True, nogil=True)
+def _pick(values: NDArray[Any], beams: NDArray[np.int64], out: NDArray[Any]) -> None:
+    for n in range(len(values)):
+        for k in range(values.shape[1]):
+            if beams[n, k] >= 0:
+                out[n, k] = values[n, beams[n, k]]

@@ -137,3 +137,45 @@ def test_unlabelled_sequence_counts_as_unlabelled(tmp_path):
     fields, _ = source.fetch(np.arange(5))
     assert (fields["labels"] == 255).all()
     assert "intensities" not in fields
+
+
+def test_statistics_of_a_large_split_read_few_chunks(data, monkeypatch):
+    whole = make_source(data, in_memory=False).compute_statistics("RIA")
+    monkeypatch.setattr("semantic2d_dataset.access.scan_source._STATISTICS_SCANS", 100)
+    source = make_source(data, in_memory=False)
+    read = []
+    one = ScanSource._read
+    monkeypatch.setattr(
+        ScanSource, "_read", lambda self, *what: (read.append(what[1:]), one(self, *what))[1]
+    )
+    found = source.compute_statistics("RIA")
+    assert len(read) == 2 * 3  # every fourth of nine chunks; labels and poses are not needed
+    np.testing.assert_allclose(found.mean, whole.mean, rtol=0.05)
+    np.testing.assert_allclose(found.std, whole.std, rtol=0.05)
+
+
+@pytest.mark.parametrize("scheme", ["block", "frame"])
+def test_another_split_reads_from_the_same_files(data, scheme):
+    train = make_source(data, in_memory=True, scheme=scheme)
+    other = train.of_split("val")
+    expected = make_source(data, in_memory=True, split="val", scheme=scheme)
+    assert other.scan_ids.tolist() == expected.scan_ids.tolist()
+    fields, rows = other.fetch(np.arange(len(other)))
+    np.testing.assert_array_equal(
+        fields["ranges"][rows], expected_fields(data, other)["scans/ranges"]
+    )
+    assert train.split == "train"
+    with pytest.raises(InvalidInputError, match="unknown split"):
+        train.of_split("training")
+
+
+def test_scans_are_found_by_their_place(data):
+    source = make_source(data, in_memory=False, split="val")
+    numbers = np.arange(len(source))
+    sequences, rows = source.places_of(numbers)
+    np.testing.assert_array_equal(source.numbers_at(sequences, rows), numbers)
+    places = {*zip(sequences.tolist(), rows.tolist(), strict=True)}
+    for sequence, row in ((0, -1), (0, 150), (2, 10_000), (3, 0)):
+        assert source.numbers_at(np.array([sequence]), np.array([row])) == -1
+    absent = next(row for row in range(150) if (1, row) not in places)
+    assert source.numbers_at(np.array([1]), np.array([absent])) == -1
