@@ -11,11 +11,11 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from semantic2d_dataset.access.registry import MINI
-from semantic2d_dataset.format.splits import NONE, TEST, TRAIN, VAL, SplitScheme
+from semantic2d_dataset.format.leakage import Audit, audit_schemes, read_tracks
+from semantic2d_dataset.format.splits import SplitScheme
 from semantic2d_dataset.publishing.about import About, Author
 from semantic2d_dataset.publishing.facts import Facts, LidarFacts
 from semantic2d_dataset.publishing.licenses import UNKNOWN, find_spdx, hugging_face_license
-from semantic2d_dataset.publishing.nearness import NEAR_S, near_share
 from semantic2d_dataset.publishing.statistics import STATISTICS_NAME, shares_of
 
 CARD_NAME = "DATASET_CARD.md"
@@ -59,7 +59,7 @@ def _context(facts: Facts, about: About) -> dict[str, Any]:
     counts = [np.sum([s.counts for s in lidar.sequences], axis=0) for lidar in lidars]
     columns = [*counts, np.sum(counts, axis=0)]
     shares = [shares_of(column) for column in columns]
-    stamps = {each.entry.id: each.stamps_ns for each in sequences}
+    audits = audit_schemes(_ordered(facts.schemes), read_tracks(facts.data.root, manifest))
     return {
         "about": about,
         "front_matter": _front_matter(facts, about),
@@ -80,8 +80,7 @@ def _context(facts: Facts, about: About) -> dict[str, Any]:
             for i, name in enumerate(facts.taxonomy.names)
         ],
         "labelled_beams": [f"{int(column.sum()):,}" for column in columns],
-        "near_s": NEAR_S,
-        "schemes": [_scheme(each, near_share(each, stamps)) for each in _ordered(facts.schemes)],
+        "schemes": [_scheme(each) for each in audits],
         "origins": _origins(facts),
         "label_facts": _label_facts(facts),
         "has_statistics": (facts.data.root / STATISTICS_NAME).is_file(),
@@ -143,12 +142,13 @@ def _ordered(schemes: Mapping[str, SplitScheme]) -> list[SplitScheme]:
     )
 
 
-def _scheme(scheme: SplitScheme, near: float | None) -> dict[str, Any]:
-    members = np.concatenate([np.zeros(0, np.uint8), *scheme.membership.values()])
+def _scheme(audit: Audit) -> dict[str, Any]:
+    scheme, found = audit.scheme, audit.of("test").summarise()
+    near = [found[key] for key in ("next_to_train", "within_1_s", "within_25_cm_15_deg")]
     return {
         "name": scheme.name,
-        "sizes": [f"{int((members == split).sum()):,}" for split in (TRAIN, VAL, TEST, NONE)],
-        "near": "no test scan" if near is None else f"{near:.1%}",
+        "sizes": [f"{size:,}" for size in scheme.sizes.values()],
+        "near": ["-" if share is None else f"{share:.1%}" for share in near],
         "meaning": _MEANINGS.get(scheme.name, "a scheme of this data set's own."),
         "made_by": scheme.made_by.rstrip("."),
     }

@@ -3,15 +3,8 @@ import pytest
 
 from semantic2d_dataset.errors import CorruptFileError
 from semantic2d_dataset.format.manifest import Manifest, SequenceEntry
-from semantic2d_dataset.format.splits import (
-    NONE,
-    TEST,
-    TRAIN,
-    SplitScheme,
-    schemes_of,
-    write_scheme,
-)
-from semantic2d_dataset.publishing.nearness import near_share
+from semantic2d_dataset.format.split_schemes import schemes_of
+from semantic2d_dataset.format.splits import NONE, TEST, TRAIN, SplitScheme, write_scheme
 from semantic2d_dataset.publishing.schemes import read_schemes, schemes_for
 
 PLACES = ("attic", "lobby", "office", "roof")
@@ -68,13 +61,19 @@ def test_another_recording_joins_the_split_of_its_environment(before):
     assert set(found["garden--two--a"]) == {TRAIN}
 
 
-def test_another_lidar_joins_train_and_a_known_one_its_like(before):
+def test_another_recording_joins_the_lidar_scheme_as_its_lidar_is_used(before):
     stamps, schemes, _ = before
     ids = {name: np.full(400, TEST, np.uint8) for name in stamps}
-    schemes = schemes | {"lidar": SplitScheme("lidar", ids, "test a")}
-    found = extended((stamps, schemes, manifest_of(stamps, schemes)), "x--one--a", "x--one--b")
+    ids["attic--one--b"] = np.full(400, TRAIN, np.uint8)
+    stamps = stamps | stamps_of("attic--one--b")
+    schemes = schemes | {"lidar": SplitScheme("lidar", ids, "train b; test a")}
+    new = ("x--one--a", "x--one--b", "x--one--c")
+    found = extended((stamps, schemes, manifest_of(stamps, schemes)), *new)
     assert set(found["lidar"]["x--one--a"]) == {TEST}
-    assert set(found["lidar"]["x--one--b"]) == {TRAIN}
+    block = found["block"]["x--one--b"]
+    assert np.array_equal(found["lidar"]["x--one--b"], np.where(block == TEST, NONE, block))
+    assert TRAIN in found["lidar"]["x--one--b"]
+    assert set(found["lidar"]["x--one--c"]) == {NONE}
 
 
 def test_what_a_scheme_of_ones_own_left_out_stays_out_and_what_is_new_is_in_no_split(before):
@@ -96,13 +95,3 @@ def test_a_file_under_the_name_of_another_scheme_is_refused(before, tmp_path):
     write_scheme(tmp_path / "block.h5", before[1]["frame"])
     with pytest.raises(CorruptFileError, match="expected the scheme block, found frame"):
         read_schemes(tmp_path)
-
-
-def test_nearness_is_in_time_and_over_all_lidars_of_a_recording():
-    stamps = stamps_of("a--one--x", "a--one--y", "b--one--x", scans=10)
-    apart = {"a--one--x": TRAIN, "b--one--x": TEST}
-    ids = {name: np.full(10, split, np.uint8) for name, split in apart.items()}
-    assert near_share(SplitScheme("s", ids, ""), stamps) == 0
-    ids["a--one--y"] = np.full(10, TEST, np.uint8)
-    assert near_share(SplitScheme("s", ids, ""), stamps) == 0.5
-    assert near_share(SplitScheme("s", {"a--one--x": ids["a--one--x"]}, ""), stamps) is None
