@@ -173,6 +173,11 @@ WRONG = [
         {"splits": {"environment": {"val": ["rom"]}}},
         "splits.environment.val: no environment 'rom'; did you mean 'room'?",
     ),
+    (
+        {"splits": {"lidar": {"tests": []}}},
+        "splits.lidar: unknown key 'tests'; did you mean 'test'?",
+    ),
+    ({"splits": {"lidar": {"test": []}}}, "splits.lidar.test: is empty"),
     ({"splits": {"environment": {}}}, "splits.environment: needs 3 environments, found room"),
 ]
 

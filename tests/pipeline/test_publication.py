@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, Semantic2DError
 from semantic2d_dataset.format.manifest import find_problems, read_manifest
 from semantic2d_dataset.pipeline.config import Config
 from semantic2d_dataset.pipeline.publication import publish_sequences
-from tests.generators import make_sequence
+from tests.generators import SMALL_LIDAR, make_sequence
 from tests.pipeline.drives import files_of
 
 PLACES = ("lobby", "hall", "office")
@@ -71,6 +72,24 @@ def test_what_is_said_otherwise_is_published_again(change, made):
     )
     assert not find_problems(config.out, full=True)
     assert not publish_sequences(replace(config, **change), files, {})
+
+
+def test_lidars_are_divided_as_said(tmp_path):
+    folder = tmp_path / "data" / "work" / "labelled"
+    folder.mkdir(parents=True)
+    lidars = [replace(SMALL_LIDAR, name=name) for name in ("small", "other")]
+    files = [folder / f"hall--a--{lidar.name}.h5" for lidar in lidars]
+    for file, lidar in zip(files, lidars, strict=True):
+        make_sequence(file, 100, environment="hall", recording="a", lidar=lidar)
+    config = make_config(tmp_path, splits={"lidar": {"test": ["other"], "gap_s": 0.2}})
+    assert publish_sequences(config, files, {})
+    scheme = OpenDataset(config.out, read_manifest(config.out)).scheme("lidar")
+    assert scheme.made_by.startswith("train small; test other; ")
+    assert len(scheme.scans_of("hall--a--other", "test")) == 100
+    assert not len(scheme.scans_of("hall--a--small", "test"))
+    unknown = replace(config, splits={"lidar": {"test": ["othr"]}})
+    with pytest.raises(InvalidInputError, match="lidar 'othr'; did you mean 'other'?"):
+        publish_sequences(unknown, sorted((config.out / "sequences").glob("*.h5")), {})
 
 
 def test_dropped_scans_belong_to_no_split(made):
