@@ -16,12 +16,17 @@ from tests.publishing.rooms import add, make_rooms
 LOBBY = "lobby--first--small"
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = make_rooms(tmp_path_factory.mktemp("made") / "rooms")
+    publish(folder, name="rooms", version="1.2.3", license="MIT")
+    return folder
+
+
 @pytest.fixture
-def pair(tmp_path):
+def pair(made, tmp_path):
     """A data set twice."""
-    old = make_rooms(tmp_path / "old")
-    publish(old, name="rooms", version="1.2.3", license="MIT")
-    return old, shutil.copytree(old, tmp_path / "new")
+    return tuple(shutil.copytree(made, tmp_path / which) for which in ("old", "new"))
 
 
 def rewrite(folder, **changes):
