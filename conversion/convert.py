@@ -97,7 +97,7 @@ def convert_recording(
         key = facts["conversion"]
         if not force and done.is_whole(key) and not _is_dataset(done.files(key)):
             return tuple(_kept(file) for file in done.files(key))
-        plans = source.plans(options)
+        plans = _plans(source, options)
         with_lists = any(plan.members is not None for plan in plans)
         if with_lists and out.suffix in _FILES:
             raise InvalidInputError(
@@ -131,6 +131,12 @@ def find_kept(
         key = facts_of(source, options)["conversion"]
     done = find_done(out)
     return tuple(map(_kept, done.files(key))) if done.is_whole(key) else ()
+
+
+def _plans(source: Source, options: Options) -> Sequence[SequencePlan]:
+    """Decide what becomes of a recording; which lidars are wanted is no matter of its kind."""
+    plans, wanted = source.plans(replace(options, only_lidars=())), options.only_lidars
+    return [plan for plan in plans if not wanted or plan.header.lidar.name in wanted]
 
 
 def _write(file: Path, plan: SequencePlan, facts: Facts, sequences: int) -> Summary:

@@ -12,7 +12,7 @@ from semantic2d_dataset.errors import WriteError
 from semantic2d_dataset.format.manifest import publish
 from semantic2d_dataset.format.sequence import SequenceReader, slug
 from semantic2d_dataset.format.split_schemes import schemes_of
-from semantic2d_dataset.format.splits import NONE, SplitScheme, read_scheme
+from semantic2d_dataset.format.splits import BY_LISTS, NONE, SplitScheme, read_scheme
 from semantic2d_dataset.format.writing import write_bytes_atomically
 
 FRAME = "frame"
@@ -59,7 +59,7 @@ def publish_with_lists(folder: Path, plans: Sequence[SequencePlan]) -> None:
         name=slug(folder.resolve().name),
         version=_VERSION,
         license=plans[0].header.license,
-        schemes=[*standard, SplitScheme(FRAME, members, "the lists of the source")],
+        schemes=[*standard, SplitScheme(FRAME, members, BY_LISTS)],
     )
 
 

@@ -40,6 +40,8 @@ class Options:
         ``header``, ``record``, or ``auto``: header stamps where they can be used.
     lidar
         A lidar of the release or a YAML file; None recognises or describes it.
+    only_lidars
+        Sequences of other lidars are left out; none means all lidars.
     velocity
         Topic of the velocity commands; ``auto`` or ``none``.
     streams
@@ -70,6 +72,7 @@ class Options:
     mount: Mount | None = None
     stamps: str = "auto"
     lidar: str | None = None
+    only_lidars: tuple[str, ...] = ()
     velocity: str = "auto"
     streams: tuple[str, ...] = ()
     no_return: tuple[float, ...] = ()

@@ -45,6 +45,20 @@ def find_recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
     return found
 
 
+def holds_layout(archive: Path) -> bool:
+    """Tell whether a file is an archive that holds recordings of a layout that is known.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+    """
+    if not is_archive(archive):
+        return False
+    with open_tree(archive) as tree:
+        return is_release(tree.names) or is_ogm(tree.names)
+
+
 def open_source(paths: Sequence[Path], options: Options) -> Source:
     """Open a recording of any kind.
 

@@ -19,6 +19,9 @@ from semantic2d_dataset.format.writing import ContainerWriter, root_attributes
 TRAIN, VAL, TEST, NONE = 0, 1, 2, 255
 SPLIT_IDS = MappingProxyType({"train": TRAIN, "val": VAL, "dev": VAL, "test": TEST})
 
+BY_LISTS = "the lists of the source"
+"""What the `frame` scheme says that was made of the lists of a published layout."""
+
 
 @dataclass(frozen=True)
 class SplitScheme:

@@ -19,6 +19,7 @@ from conversion.summary import Summary
 from semantic2d_dataset.errors import InvalidInputError, RecordingError
 from semantic2d_dataset.format.sequence import SequenceReader
 from tests.conversion.recordings import BEAMS, KINDS, START_NS, Recording, straight_drive
+from tests.conversion.releases import make_release
 
 
 def names_in(folder: Path) -> list[str]:
@@ -238,3 +239,18 @@ def test_what_would_be_kept_is_told_and_nothing_is_made(tmp_path):
     assert find_kept([path], out, Options(license="MIT")) == ()
     Path(results[0].file).unlink()
     assert find_kept([path], out) == ()
+
+
+def test_sequences_of_other_lidars_are_left_out_and_may_come_later(tmp_path):
+    both = tmp_path / "both"
+    make_release(both / "one", sessions=("2024-04-04-12-16-41",), scans=3)
+    make_release(both / "two", sessions=("2024-04-04-12-16-41",), scans=3, beams=811)
+    out = tmp_path / "out"
+    (only,) = convert_recording(both, out, Options(only_lidars=("wlr-716",)))
+    assert only.sequence_id == "two--2024-04-04-12-16-41--wlr-716"
+    assert convert_recording(both, out, Options(only_lidars=("rplidar-s2",))) == ()
+    both_of_them = convert_recording(both, out, replace_outdated=True)
+    assert [each.sequence_id for each in both_of_them] == [
+        "one--2024-04-04-12-16-41--hokuyo-utm-30lx-ew",
+        only.sequence_id,
+    ]
