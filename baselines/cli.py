@@ -59,8 +59,8 @@ def train(
     """Train a model, and keep the epoch that does best on the validation split."""
     from baselines import training
     from baselines.architectures import check_model
-    from semantic2d_dataset.access.torch_datasets import load_dataset
     from semantic2d_dataset.access.transforms import default_augmentation
+    from semantic2d_dataset.loading import load_dataset
 
     check_model(model)
     check_free(out / "model.json", force=force or resume)
@@ -198,7 +198,7 @@ def import_weights(
     check_free(out / "model.json", force=force)
     from baselines.checkpoints import save_checkpoint
     from baselines.published_weights import load_published
-    from semantic2d_dataset.access.torch_datasets import load_dataset
+    from semantic2d_dataset.loading import load_dataset
     from semantic2d_dataset.scene.lidars import find_lidar
 
     if data is None:
@@ -274,7 +274,7 @@ def _scans_for(
     checkpoint: Checkpoint, data: str, lidar: str | None, split: str, scheme: str
 ) -> LidarDataset:
     """Load the scans of a split as a model wants them."""
-    from semantic2d_dataset.access.torch_datasets import load_dataset
+    from semantic2d_dataset.loading import load_dataset
 
     return load_dataset(
         data,

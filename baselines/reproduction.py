@@ -34,11 +34,11 @@ from baselines.training import train
 from semantic2d_dataset.access.features import channel_count
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.access.scan_source import ScanSource
-from semantic2d_dataset.access.torch_datasets import load_dataset
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, LeakageWarning
 from semantic2d_dataset.executors import open_executor
 from semantic2d_dataset.format.container import load_json
 from semantic2d_dataset.format.writing import write_text_atomically
+from semantic2d_dataset.loading import load_dataset
 from semantic2d_dataset.scoring.metrics import percent
 from semantic2d_dataset.scoring.published import ALL, METRICS, ClassFigures
 from semantic2d_dataset.simulation.mini import combined_digest

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         HokuyoUTM30LXEW,
         LidarDataset,
         RPLidarS2,
-        load_dataset,
     )
     from semantic2d_dataset.access.torch_lidars import load_lidars
     from semantic2d_dataset.access.torch_samplers import Shard
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
         SequenceWriter,
     )
     from semantic2d_dataset.format.splits import SplitScheme
+    from semantic2d_dataset.loading import load_dataset
     from semantic2d_dataset.scene.geometry import Pose2
     from semantic2d_dataset.scene.lidars import LidarSpec
     from semantic2d_dataset.scene.maps import SemanticMap
@@ -61,7 +61,7 @@ _HOMES = {
     "Taxonomy": "scene.taxonomy",
     "WLR716": "access.torch_datasets",
     "dask_arrays": "access.dask_arrays",
-    "load_dataset": "access.torch_datasets",
+    "load_dataset": "loading",
     "load_lidars": "access.torch_lidars",
     "open_dataset": "access.registry",
     "publish": "format.manifest",

@@ -6,7 +6,6 @@ import contextlib
 import fnmatch
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,9 +17,9 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from semantic2d_dataset.access.file_lists import Locations, check_files
-from semantic2d_dataset.access.known_datasets import FileTable, KnownDataset, RemoteFile
+from semantic2d_dataset.access.known_datasets import ALL, FileTable, KnownDataset, RemoteFile
 from semantic2d_dataset.access.partials import Partial
-from semantic2d_dataset.access.registry import home
+from semantic2d_dataset.access.places import home, is_offline
 from semantic2d_dataset.access.web import AttemptError, new_session, open_url, persist
 from semantic2d_dataset.errors import (
     ChecksumError,
@@ -33,7 +32,6 @@ from semantic2d_dataset.errors import (
 from semantic2d_dataset.format.container import load_json
 from semantic2d_dataset.format.writing import write_text_atomically
 
-OFFLINE_VARIABLE = "SEMANTIC2D_OFFLINE"
 LIST_NAME = ".files.json"
 """The list of files as it was last seen, kept beside them for the time without a network."""
 
@@ -73,13 +71,14 @@ def download_folder(dataset: KnownDataset) -> Path:
     return home() / "downloads" / f"{dataset.id}-{dataset.version}"
 
 
-def is_offline() -> bool:
-    """Tell whether ``SEMANTIC2D_OFFLINE`` forbids downloads."""
-    return os.environ.get(OFFLINE_VARIABLE, "").strip().lower() not in ("", "0", "false", "no")
-
-
 def find_files(
-    dataset: KnownDataset, folder: Path, *, only: Sequence[str] = (), offline: bool = False
+    dataset: KnownDataset,
+    folder: Path,
+    *,
+    only: Sequence[str] = (),
+    part: str = ALL,
+    lidars: Sequence[str] = (),
+    offline: bool = False,
 ) -> list[RemoteFile]:
     """List the files of a data set, without fetching any.
 
@@ -91,6 +90,10 @@ def find_files(
         Where the files are or will be.
     only
         Glob patterns over whole names; all files where none is given.
+    part
+        One of `known_datasets.PARTS`.
+    lidars
+        Files are left out of which it is told that they hold scans of other lidars only.
     offline
         Ask no host; nor is one asked where `is_offline`.
 
@@ -104,9 +107,9 @@ def find_files(
         If no host may be asked and the list was not kept.
     """
     if offline or is_offline():
-        return _choose(_kept_or_fail(dataset, folder), only)
+        return _choose(dataset, _kept_or_fail(dataset, folder), only, part, lidars)
     with new_session() as session:
-        return _choose(_locate(session, dataset, folder).files, only)
+        return _choose(dataset, _locate(session, dataset, folder).files, only, part, lidars)
 
 
 def download(
@@ -114,6 +117,8 @@ def download(
     folder: Path,
     *,
     only: Sequence[str] = (),
+    part: str = ALL,
+    lidars: Sequence[str] = (),
     offline: bool = False,
 ) -> list[LocalFile]:
     """Get the files of a data set that are not in a folder yet, and check all of them.
@@ -129,6 +134,10 @@ def download(
         Is made where there is none.
     only
         Glob patterns over whole names; all files where none is given.
+    part
+        One of `known_datasets.PARTS`.
+    lidars
+        Files are left out of which it is told that they hold scans of other lidars only.
     offline
         Ask no host: check what is there; so it is where `is_offline`.
 
@@ -146,7 +155,7 @@ def download(
         If the disk is or would be full.
     """
     if offline or is_offline():
-        files = _choose(_kept_or_fail(dataset, folder), only)
+        files = _choose(dataset, _kept_or_fail(dataset, folder), only, part, lidars)
         missing = [file for file in files if not _is_there(folder, file)]
         if missing:
             raise OfflineError(
@@ -157,7 +166,7 @@ def download(
         return [_local(folder, file) for file in files]
     with new_session() as session:
         locations = _locate(session, dataset, folder)
-        files = _choose(locations.files, only)
+        files = _choose(dataset, locations.files, only, part, lidars)
         missing = [file for file in files if not _is_there(folder, file)]
         folder.mkdir(parents=True, exist_ok=True)
         _check_space(folder, missing)
@@ -229,13 +238,32 @@ def _kept_or_fail(dataset: KnownDataset, folder: Path) -> list[RemoteFile]:
     return files
 
 
-def _choose(files: Sequence[RemoteFile], only: Sequence[str]) -> list[RemoteFile]:
+def _choose(
+    dataset: KnownDataset,
+    files: Sequence[RemoteFile],
+    only: Sequence[str],
+    part: str,
+    lidars: Sequence[str],
+) -> list[RemoteFile]:
     for pattern in only:
         if not any(fnmatch.fnmatchcase(file.name, pattern) for file in files):
             raise InvalidInputError(
                 f"no file fits {pattern!r}; the {len(files)} there are: {_names(files)}"
             )
-    return [f for f in files if not only or any(fnmatch.fnmatchcase(f.name, p) for p in only)]
+    chosen = [
+        file
+        for file in files
+        if (not only or any(fnmatch.fnmatchcase(file.name, pattern) for pattern in only))
+        and dataset.belongs(file.name, part)
+        and (not lidars or dataset.may_hold(file.name, lidars))
+    ]
+    if files and not chosen:
+        what = f"{part} data" + (f" of {', '.join(lidars)}" if lidars else "")
+        raise InvalidInputError(
+            f"{dataset.name}: none of these files is told by its name to be {what}: "
+            f"{_names(files)}; get them as they are with --archives-only --part all"
+        )
+    return chosen
 
 
 def _names(files: Sequence[RemoteFile], most: int = 5) -> str:
@@ -251,7 +279,7 @@ def _is_there(folder: Path, file: RemoteFile) -> bool:
     path = folder / file.name
     if not path.exists():
         return False
-    if not path.is_file() or path.stat().st_size != file.size or not _matches(path, file):
+    if not path.is_file() or path.stat().st_size != file.size or not matches(path, file):
         raise ChecksumError(
             f"{path}: is not the file of {file.size} bytes with {file.checksum}; "
             "move it away, and run this again"
@@ -305,7 +333,7 @@ def _fetch(session: requests.Session, file: RemoteFile, target: Path, urls: Iter
                 except AttemptError as err:
                     failures.append(str(err))
                     break
-                if partial.size == file.size and _matches(partial.path, file):
+                if partial.size == file.size and matches(partial.path, file):
                     partial.publish()
                     return
                 partial.path.write_bytes(b"")
@@ -371,8 +399,8 @@ def _check_answer(response: requests.Response, url: str, file: RemoteFile, offse
     return offset
 
 
-def _matches(path: Path, file: RemoteFile) -> bool:
-    """Tell whether the bytes of a file have the digest that its list gives."""
+def matches(path: Path, file: RemoteFile) -> bool:
+    """Tell whether the bytes of a file, of the size listed, have the digest that its list gives."""
     kind, _, digits = file.checksum.partition(":")
     name = "sha1" if kind == "git" else kind
     digest = hashlib.new(name, usedforsecurity=kind == "sha256")

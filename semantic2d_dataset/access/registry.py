@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import platformdirs
 from filelock import FileLock
 
-from semantic2d_dataset.errors import (
-    DatasetNotFoundError,
-    InvalidInputError,
-    Semantic2DError,
+from semantic2d_dataset.access.installed import (
+    datasets_home,
+    find_installed,
+    is_complete,
+    is_installed,
+    write_record,
 )
+from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
 from semantic2d_dataset.format.manifest import (
     MANIFEST_NAME,
     Manifest,
@@ -27,8 +29,9 @@ from semantic2d_dataset.format.splits import SplitScheme, read_scheme
 from semantic2d_dataset.format.writing import make_folder
 from semantic2d_dataset.scene.lidars import full_name
 
-HOME_VARIABLE = "SEMANTIC2D_HOME"
-MINI = "semantic2d-mini"
+MINI, MINI_VERSION = "semantic2d-mini", "1.1.0"
+_MINI_NAMES = (MINI, f"{MINI}@{MINI_VERSION}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(@[A-Za-z0-9][A-Za-z0-9._-]*)?")
 
 
 @dataclass(frozen=True)
@@ -119,56 +122,68 @@ class OpenDataset:
         return reader
 
 
-def home() -> Path:
-    """Return the folder that data sets are kept in: ``SEMANTIC2D_HOME`` or the user's cache."""
-    chosen = os.environ.get(HOME_VARIABLE)
-    return Path(chosen) if chosen else platformdirs.user_cache_path("semantic2d_dataset")
-
-
-def open_dataset(name: str | Path) -> OpenDataset:
-    """Open a data set by its folder, or by its name if it is one of those known.
+def open_dataset(
+    name: str | Path, *, version: str | None = None, registry: Path | str | None = None
+) -> OpenDataset:
+    """Open a data set by its folder, or by its name if it is installed.
 
     ``semantic2d-mini`` is made on first use.
 
     Parameters
     ----------
     name
-        A folder that holds ``dataset.json``, or ``semantic2d-mini``; a Path is always a folder.
+        A folder that holds ``dataset.json``, or a name: ``semantic2d``, of which the newest
+        version is meant, or ``semantic2d@1``. A Path is always a folder.
+    version
+        The other way to say a version.
+    registry
+        A file or URL of known data sets; ``SEMANTIC2D_REGISTRY`` where not given, if set.
 
     Raises
     ------
     DatasetNotFoundError
-        If it is neither.
+        If it is neither; for one that is known, it says how to get it.
+    InvalidInputError
+        If a version is given twice, or of a folder.
     CorruptFileError, FormatVersionError
         If the manifest cannot be read.
     """
-    if name == MINI:
-        return _open_mini()
-    folder = Path(name)
-    if not name or not (folder / MANIFEST_NAME).is_file():
-        raise DatasetNotFoundError(
-            f"{name}: neither a folder with {MANIFEST_NAME} nor a known data set; known: {MINI}"
-        )
+    folder = find_folder(name, version=version, registry=registry)
     return OpenDataset(folder, read_manifest(folder))
 
 
-def _open_mini() -> OpenDataset:
-    from semantic2d_dataset.simulation.mini import MINI_VERSION, make_mini
+def find_folder(
+    name: str | Path, *, version: str | None = None, registry: Path | str | None = None
+) -> Path:
+    """Return the folder of a data set as `open_dataset` finds it, also if it is damaged."""
+    if version is not None and (isinstance(name, Path) or "@" in name):
+        raise InvalidInputError(f"{name}: a version goes with the name of a data set alone")
+    if isinstance(name, str) and (name if version is None else f"{name}@{version}") in _MINI_NAMES:
+        return _find_mini()
+    if name and version is None and is_installed(Path(name)):
+        return Path(name)
+    if isinstance(name, str) and _NAME.fullmatch(name):
+        return find_installed(name, version=version, registry=registry)
+    raise DatasetNotFoundError(
+        f"{name}: neither a folder with {MANIFEST_NAME} nor the name of a known data set, such as "
+        f"{MINI}; see: semantic2d list"
+    )
 
-    folder = home() / f"{MINI}-{MINI_VERSION}"
-    if not _is_complete(folder):
+
+def _find_mini() -> Path:
+    folder = datasets_home() / f"{MINI}-{MINI_VERSION}"
+    if not is_complete(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         # the lock saves work; it is the renaming that keeps it right
-        with FileLock(folder.with_name(f"{folder.name}.lock")):
-            if not _is_complete(folder):
-                make_folder(folder, make_mini, lambda: _is_complete(folder))
-    return OpenDataset(folder, read_manifest(folder))
+        with FileLock(folder.with_name(f".{folder.name}.lock")):
+            if not is_complete(folder):
+                make_folder(folder, make_mini_whole, lambda: is_complete(folder))
+    return folder
 
 
-def _is_complete(folder: Path) -> bool:
-    """Tell whether every file that the manifest names is there with its size."""
-    try:
-        files = read_manifest(folder).files
-        return all((folder / e.file).stat().st_size == e.bytes for e in files)
-    except (Semantic2DError, OSError):
-        return False
+def make_mini_whole(folder: Path) -> None:
+    """Make ``semantic2d-mini`` with the record that an installed data set has."""
+    from semantic2d_dataset.simulation.mini import make_mini
+
+    make_mini(folder)
+    write_record(folder, f"{MINI}@{MINI_VERSION}")

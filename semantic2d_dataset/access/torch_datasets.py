@@ -288,15 +288,15 @@ _CLASSES = {
 }
 
 
-def load_dataset(
-    name: str | Path, *, lidar: str, split: str | None = "train", **options: Any
+def load_lidar(
+    data: OpenDataset, *, lidar: str, split: str | None = "train", **options: Any
 ) -> LidarDataset:
-    """Load one lidar's scans of one split of a data set.
+    """Load one lidar's scans of one split, by the class of that lidar.
 
     Parameters
     ----------
-    name
-        ``semantic2d-mini`` (made on first use), or the folder of a data set.
+    data
+        An open data set.
     lidar
         ``hokuyo``, ``wlr716``, ``rplidar``, or any name that the data set uses.
     split
@@ -308,11 +308,6 @@ def load_dataset(
     ------
     DatasetNotFoundError, InvalidInputError, CorruptFileError
         As from `LidarDataset`.
-
-    Examples
-    --------
-    >>> train = load_dataset("semantic2d-mini", lidar="hokuyo", features="RIA")  # doctest: +SKIP
     """
-    data = open_dataset(name)
     found = data.sequences(lidar)[0].lidar
     return _CLASSES.get(found, LidarDataset)(data, lidar=found, split=split, **options)

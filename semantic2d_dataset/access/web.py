@@ -119,6 +119,31 @@ def open_url(session: requests.Session, url: str, offset: int = 0) -> Iterator[r
         raise AttemptError(f"{url}: {_in_words(err)}") from err
 
 
+def get_body(session: requests.Session, url: str, most: int) -> bytes:
+    """Get a document whole, patiently.
+
+    Parameters
+    ----------
+    session
+        Asks the host.
+    url
+        Where it lies.
+    most
+        Bytes that it may have.
+
+    Raises
+    ------
+    AttemptError
+        If it cannot be had, or is longer.
+    """
+
+    def attempt() -> bytes:
+        with open_url(session, url) as response:
+            return _read_body(response, url, most)
+
+    return persist(attempt)
+
+
 def get_json(session: requests.Session, url: str) -> tuple[Any, str | None]:
     """Get a JSON document, patiently, and the URL of its next page where it has one.
 
@@ -130,11 +155,7 @@ def get_json(session: requests.Session, url: str) -> tuple[Any, str | None]:
 
     def attempt() -> tuple[Any, str | None]:
         with open_url(session, url) as response:
-            body = b""
-            for chunk in response.iter_content(1 << 16):
-                body += chunk
-                if len(body) > _LONGEST_ANSWER:
-                    raise AttemptError(f"{url}: an endless list", again=False)
+            body = _read_body(response, url, _LONGEST_ANSWER)
             following = response.links.get("next", {}).get("url")
         try:
             return load_json(body), following and urljoin(url, following)
@@ -142,6 +163,15 @@ def get_json(session: requests.Session, url: str) -> tuple[Any, str | None]:
             raise AttemptError(f"{url}: expected a list of files: {err}") from err
 
     return persist(attempt)
+
+
+def _read_body(response: requests.Response, url: str, most: int) -> bytes:
+    body = b""
+    for chunk in response.iter_content(1 << 16):
+        body += chunk
+        if len(body) > most:
+            raise AttemptError(f"{url}: sends more than {most} bytes", again=False)
+    return body
 
 
 def check_scheme(before: str, after: str) -> None:

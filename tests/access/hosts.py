@@ -165,6 +165,14 @@ def drip(handler, body, offset):
         time.sleep(0.05)
 
 
+def drip_slowly(handler, body, offset):
+    """A hundred bytes at a time, for as long as a client bears it."""
+    start(handler, 200, len(body))
+    for k in range(0, len(body), 100):
+        handler.wfile.write(body[k : k + 100])
+        time.sleep(0.05)
+
+
 def other_length(handler, body, offset):
     send(handler, body + b"more", 0)
 

@@ -22,6 +22,7 @@ from semantic2d_dataset.access.known_datasets import (
     RemoteFile,
     find_known,
 )
+from semantic2d_dataset.access.places import OFFLINE_VARIABLE
 from semantic2d_dataset.errors import (
     ChecksumError,
     DownloadError,
@@ -43,7 +44,7 @@ def waits(monkeypatch):
     monkeypatch.setattr(web, "time", SimpleNamespace(sleep=found.append, time=lambda: 1e9))
     monkeypatch.setattr(web, "TIMEOUTS_S", (2, 0.3))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.delenv(module.OFFLINE_VARIABLE, raising=False)
+    monkeypatch.delenv(OFFLINE_VARIABLE, raising=False)
     return found
 
 
@@ -306,7 +307,7 @@ def test_offline_says_what_is_missing_and_where_it_belongs(make_host, tmp_path, 
         download(host.dataset(), tmp_path, offline=True)
     download(host.dataset(), tmp_path, only=["a.zip"])
     asked = len(host.requests)
-    monkeypatch.setenv(module.OFFLINE_VARIABLE, "1")
+    monkeypatch.setenv(OFFLINE_VARIABLE, "1")
     with pytest.raises(OfflineError, match=f"b.zip is missing; put them into {tmp_path}"):
         download(host.dataset(), tmp_path)
     (tmp_path / "b.zip").write_bytes(BIG)
@@ -361,7 +362,7 @@ def test_processes_without_locks_leave_one_good_file(count, host, tmp_path):
     assert (tmp_path / "big.zip").read_bytes() == BIG
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kills", [2, pytest.param(200, marks=pytest.mark.long)])
 def test_killed_processes_are_gone_on_from(kills, make_host, tmp_path):
     body = make_bytes(400_000 * (kills + 1))
     host = make_host({"big.zip": body})

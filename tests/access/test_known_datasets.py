@@ -130,3 +130,34 @@ def test_example_in_the_docs_can_be_read(tmp_path):
     (tmp_path / "own.json").write_text(example)
     assert len(find_known("my-building", tmp_path / "own.json").sources) == 3
     assert all(f"`{each.name}`" in text for each in known_datasets())
+
+
+def test_names_tell_raw_recordings_from_processed_data():
+    known = find_known("semantic2d")
+    raw = ["2024-04-04.bag", "Rosbags.zip", "raw_data.tar.gz", "bags/lobby.mcap"]
+    assert all(known.belongs(name, "raw") and not known.belongs(name, "processed") for name in raw)
+    assert known.belongs("semantic2d_data.zip", "processed")
+    assert all(known.belongs(name, "all") for name in [*raw, "semantic2d_data.zip"])
+
+
+def test_processed_files_may_be_told_too(registry):
+    parts = {"processed": ["*.zip"], "raw": ["raw*"]}
+    known = find_known("own", registry(ENTRY | {"parts": parts}))
+    assert [n for n in ("raw.zip", "a.zip", "a.txt") if known.belongs(n, "processed")] == ["a.zip"]
+    assert not known.belongs("a.txt", "raw")
+
+
+def test_names_tell_lidars_where_they_do_at_all():
+    known = find_known("semantic2d")
+    assert known.may_hold("data_WLR716.zip", ["wlr-716"])
+    assert not known.may_hold("data_WLR716.zip", ["rplidar-s2"])
+    assert known.may_hold("hokuyo_and_rplidar.zip", ["rplidar-s2"])
+    assert known.may_hold("everything.zip", ["rplidar-s2"])
+    assert known.lidar_names(["hokuyo", "wlr_716"]) == ("hokuyo-utm-30lx-ew", "wlr-716")
+    with pytest.raises(InvalidInputError, match="has no lidar 'velodyne'; it has hokuyo"):
+        known.lidar_names(["velodyne"])
+
+
+def test_lidar_of_any_name_is_taken_where_none_is_told(registry):
+    known = find_known("own", registry(ENTRY))
+    assert known.lidar_names(["mine", "hokuyo"]) == ("mine", "hokuyo-utm-30lx-ew")

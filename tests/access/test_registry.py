@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from semantic2d_dataset.access import registry
-from semantic2d_dataset.access.registry import HOME_VARIABLE, home, open_dataset
+from semantic2d_dataset.access.places import HOME_VARIABLE, home
+from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.errors import (
     ChecksumError,
     DatasetNotFoundError,
@@ -22,6 +23,10 @@ def small_home(tmp_path, monkeypatch):
     monkeypatch.setenv(HOME_VARIABLE, str(tmp_path / "home"))
     monkeypatch.setattr("semantic2d_dataset.simulation.mini.make_mini", make_small)
     return tmp_path / "home"
+
+
+def folders_in(home):
+    return sorted(p.name for p in (home / "datasets").iterdir() if p.is_dir())
 
 
 def make_small(folder):
@@ -55,7 +60,9 @@ def test_damaged_mini_is_made_again(damage, small_home):
         (data.root / "dataset.json").unlink()
     again = open_dataset("semantic2d-mini")
     assert victim.stat().st_size == again.manifest.sequences[0].bytes
-    assert sorted(p.name for p in small_home.iterdir() if p.is_dir()) == [data.root.name]
+    assert sorted(p.name for p in (small_home / "datasets").iterdir() if p.is_dir()) == [
+        data.root.name
+    ]
 
 
 def test_interrupted_making_leaves_nothing(small_home, monkeypatch):
@@ -66,7 +73,7 @@ def test_interrupted_making_leaves_nothing(small_home, monkeypatch):
     monkeypatch.setattr("semantic2d_dataset.simulation.mini.make_mini", interrupted)
     with pytest.raises(KeyboardInterrupt):
         open_dataset("semantic2d-mini")
-    assert [p for p in small_home.iterdir() if p.is_dir()] == []
+    assert folders_in(small_home) == []
 
 
 def open_in_child(queue):
@@ -98,14 +105,13 @@ def test_processes_without_locks_make_one_good_data_set(count, small_home):
     assert [queue.get(timeout=120) for _ in workers] == [3] * count
     for worker in workers:
         worker.join()
-    folders = [p for p in small_home.iterdir() if p.is_dir()]
-    assert len(folders) == 1
-    assert len(open_dataset(folders[0]).sequences()) == 3
+    (folder,) = folders_in(small_home)
+    assert len(open_dataset(small_home / "datasets" / folder).sequences()) == 3
 
 
 @pytest.mark.parametrize("name", ["semantic2d-maxi", "/nowhere"])
 def test_unknown_data_set_lists_the_known(name):
-    with pytest.raises(DatasetNotFoundError, match="nor a known data set; known: semantic2d-mini"):
+    with pytest.raises(DatasetNotFoundError, match="neither a folder .* nor .*known data set"):
         open_dataset(name)
 
 
@@ -128,7 +134,7 @@ def test_file_changed_since_publishing_is_refused(dataset_folder, tmp_path):
 
 def test_a_path_is_a_folder_even_if_named_like_a_known_data_set(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DatasetNotFoundError, match="semantic2d-mini: neither"):
+    with pytest.raises(DatasetNotFoundError, match="semantic2d-mini: neither a folder"):
         open_dataset(Path("semantic2d-mini"))
 
 
@@ -137,7 +143,9 @@ def test_faster_process_s_data_set_is_kept(small_home):
     before = (data.root / "dataset.json").stat().st_ino
     make_folder(data.root, make_small, lambda: True)
     assert (data.root / "dataset.json").stat().st_ino == before
-    assert sorted(p.name for p in small_home.iterdir() if p.is_dir()) == [data.root.name]
+    assert sorted(p.name for p in (small_home / "datasets").iterdir() if p.is_dir()) == [
+        data.root.name
+    ]
 
 
 def test_reader_and_scheme_name_what_is_missing(dataset_folder, tmp_path):

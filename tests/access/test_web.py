@@ -98,8 +98,8 @@ def test_what_is_no_json_is_refused(body, host):
         get_json(session, f"{host.url}/list")
 
 
-def test_endless_list_is_refused(host, monkeypatch):
+def test_endless_document_is_refused(host, monkeypatch):
     monkeypatch.setattr(web, "_LONGEST_ANSWER", 1000)
     host.pages["/list"] = b" " * 1001
-    with new_session() as session, pytest.raises(AttemptError, match="endless"):
+    with new_session() as session, pytest.raises(AttemptError, match="sends more than 1000 bytes"):
         get_json(session, f"{host.url}/list")
