@@ -298,19 +298,22 @@ def find_problems(folder: Path, *, full: bool = False) -> list[Semantic2DError]:
     DatasetNotFoundError, CorruptFileError, FormatVersionError
         If there is no manifest that can be read.
     """
-    folder = Path(folder)
-    manifest = read_manifest(folder)
-    problems: list[Semantic2DError] = []
+    return [*check_files(Path(folder), read_manifest(folder), full=full).values()]
+
+
+def check_files(folder: Path, manifest: Manifest, *, full: bool) -> dict[str, Semantic2DError]:
+    """Return what `find_problems` finds, by file, where the manifest may lie elsewhere."""
+    problems: dict[str, Semantic2DError] = {}
     bar = tqdm(manifest.files, desc="verifying", unit="file", disable=None, leave=False)
     for entry in bar:
         try:
             _verify(folder, manifest, entry, full=full)
         except Semantic2DError as err:
-            problems.append(err)
+            problems[entry.file] = err
     try:
         check_checksums(folder, _digests(folder, manifest))
     except ChecksumError as err:
-        problems.append(err)
+        problems[CHECKSUMS_NAME] = err
     return problems
 
 
