@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import semantic2d_dataset
-from semantic2d_dataset.cli_data import download, verify
+from semantic2d_dataset.cli_data import download, list_, remove, show, verify
 from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
 from semantic2d_dataset.cli_publishing import card, contribute, diff, release
 from semantic2d_dataset.cli_splits import splits
@@ -79,7 +79,7 @@ def main() -> None:
     except (KeyboardInterrupt, SystemExit) as end:
         if isinstance(end, SystemExit) and end.code != _INTERRUPTED:
             raise
-        sys.stderr.write("interrupted; nothing half done was left\n")
+        sys.stderr.write(f"{_farewell(end)}\n")
         sys.exit(_INTERRUPTED)
 
 
@@ -99,6 +99,16 @@ def _leaks_in_words() -> Iterator[None]:
 
         warnings.showwarning = show_in_words
         yield
+
+
+def _farewell(end: BaseException) -> str:
+    """Return what an interrupted command says of itself, or what holds for any."""
+    cause: BaseException | None = end
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt) and cause.args:
+            return str(cause.args[0])
+        cause = cause.__cause__ or cause.__context__
+    return "interrupted; nothing half done was left"
 
 
 def _message(err: Exception) -> str:
@@ -144,13 +154,9 @@ def info(
     typer.echo(json.dumps(said, indent=1) if as_json else format_summary(said))
 
 
-app.command()(verify)
-app.command()(download)
-app.command()(table)
+for _command in (verify, download, list_, show, remove, table, release, card, diff):
+    app.command(name=_command.__name__.rstrip("_"))(_command)
 app.add_typer(splits, name="splits")
-app.command()(release)
-app.command()(card)
-app.command()(diff)
 app.add_typer(contribute, name="contribute")
 
 

@@ -10,11 +10,13 @@ import time
 
 import pytest
 
-from semantic2d_dataset import __version__, cli
+from semantic2d_dataset import __version__, cli, load_dataset
+from semantic2d_dataset.errors import DatasetNotFoundError
 from semantic2d_dataset.format.manifest import read_manifest
 from tests.access import hosts
 from tests.conftest import PROJECT
 from tests.generators import make_sequence
+from tests.pipeline.published import HOKUYO, WLR, pack_archives, write_registry
 
 
 @pytest.fixture
@@ -49,6 +51,9 @@ def test_help_lists_every_command(run):
         "card",
         "diff",
         "contribute",
+        "list",
+        "show",
+        "remove",
         "simulate",
         "score",
         "report",
@@ -180,7 +185,7 @@ def test_bad_input_gives_one_message_and_exit_1(command, kind, run, bad_files):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["info", "semantic3d"], "known: semantic2d-mini"),
+        (["info", "semantic3d"], "nor a known data set; did you mean 'semantic2d@2'?"),
         (["simulate", "{tmp}/new", "--lidar", "velodyne"], "unknown lidar 'velodyne'; known"),
         (["simulate", "{tmp}/new", "--environment", "moon"], "unknown"),
         (["simulate", "{tmp}"], "exists already; choose a new folder"),
@@ -384,6 +389,7 @@ def test_download_lists_and_then_gets_what_is_chosen(own_registry, run, tmp_path
         "2 file(s), 1.50kB",
     ]
     words = ["download", "own@1", "--registry", own_registry, "--to", tmp_path / "out"]
+    words += ["--archives-only"]
     status, out, _ = run(*words, "--only", "*.zip")
     assert status == 0
     assert out.endswith(f"1 file(s), 4.00B in {tmp_path / 'out'}, checked; 0 had been there\n")
@@ -398,15 +404,91 @@ def test_download_lists_and_then_gets_what_is_chosen(own_registry, run, tmp_path
 def test_download_goes_to_the_home_of_data_sets(own_registry, run, tmp_path, monkeypatch):
     monkeypatch.setenv("SEMANTIC2D_HOME", str(tmp_path / "home"))
     monkeypatch.setenv("SEMANTIC2D_REGISTRY", str(own_registry))
-    assert run("download", "own")[0] == 0
+    assert run("download", "own", "--part", "all")[0] == 0
     assert (tmp_path / "home" / "downloads" / "own-1" / "raw.bag").is_file()
+
+
+@pytest.fixture
+def archives(tmp_path, monkeypatch):
+    """A registry whose one data set is archives on a host of this machine."""
+    monkeypatch.setenv("SEMANTIC2D_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.delenv("SEMANTIC2D_OFFLINE", raising=False)
+    host = hosts.Host(pack_archives(tmp_path / "packed"))
+    registry = write_registry(tmp_path / "registry.json", host)
+    monkeypatch.setenv("SEMANTIC2D_REGISTRY", str(registry))
+    yield host
+    host.close()
+
+
+def test_downloaded_data_set_is_listed_loaded_repaired_and_removed(archives, run, tmp_path):
+    folder = tmp_path / "home" / "datasets" / "d-1"
+    status, _, err = run("info", "d")
+    assert (status, "get it with: semantic2d download d@1" in err) == (1, True)
+    status, out, _ = run("download", "d", "--version", "1", "--lidar", "hokuyo")
+    assert status == 0
+    assert out.splitlines()[-1].startswith(f"{folder}: 1 sequences, 6 scans of {HOKUYO}, 0.")
+    with pytest.raises(DatasetNotFoundError, match="semantic2d download d@1 --lidar wlr716"):
+        load_dataset("d", lidar="wlr716", split=None)
+    scans = load_dataset("d", lidar="wlr716", split=None, download=True)
+    assert (len(scans), scans.lidar.name) == (6, WLR)
+    said = json.loads(run("list", "--json")[1])
+    assert [each["folder"] for each in said if "folder" in each] == [str(folder)]
+    assert f"in {folder}" in run("show", "d")[1]
+    victim = next((folder / "sequences").iterdir())
+    victim.write_bytes(victim.read_bytes()[:-100])
+    assert run("verify", "d")[0] == 1
+    status, out, _ = run("verify", "d", "--repair")
+    assert status == 0
+    assert out.splitlines() == [f"{victim}: repaired", f"{folder}: 4 files, no problem(s)"]
+    assert json.loads(run("download", "d@1", "--json")[1])["changed"] is False
+    status, out, _ = run("remove", "d", "--archives-too")
+    assert status == 0
+    assert [line.partition(": removed, ")[0] for line in out.splitlines()] == [
+        str(folder),
+        str(tmp_path / "home" / "downloads" / "d-1"),
+    ]
+
+
+def test_raw_recordings_are_got_as_they_are(archives, run, tmp_path):
+    status, out, _ = run("download", "d", "--part", "raw", "--to", tmp_path / "raw")
+    assert status == 0
+    assert (tmp_path / "raw" / "rosbags.zip").read_bytes() == b"a bag"
+    assert "1 file(s), 5.00B" in out
+    assert not (tmp_path / "home" / "datasets").exists()
+    status, _, err = run("download", "d", "--lidar", "rplidar")
+    assert status == 1
+    assert f"d@1: has no lidar 'rplidar'; it has {HOKUYO}, {WLR}" in err
+
+
+def test_interrupted_download_says_that_what_has_arrived_is_kept(archives, tmp_path):
+    archives.moods = [hosts.drip_slowly] * 2
+    command = [sys.executable, "-m", "semantic2d_dataset.cli", "download", "d"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(PROJECT)}, stderr=subprocess.PIPE
+    )
+    wait_for(lambda: list((tmp_path / "home").rglob("*.partial")))
+    process.send_signal(signal.SIGINT)
+    err = process.communicate(timeout=60)[1].decode()
+    assert process.returncode in (130, -signal.SIGINT)
+    assert err.splitlines()[-1] == (
+        "interrupted; what has arrived and what is converted is kept: run this again to go on"
+    )
+    assert "nothing half done" not in err
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 60
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert condition()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["semantic2d@9"], "not a known data set; did you mean 'semantic2d@2'?"),
-        (["semantic2d-mini"], "made on this machine"),
+        (["semantic2d-mini", "--archives-only"], "made on this machine"),
         (["semantic2d", "--offline"], "offline, and its list of files is not here"),
         (["own", "--only", "*.tar"], "no file fits '*.tar'"),
         (["own", "--registry", "nowhere.json"], "nowhere.json: no such file"),
