@@ -161,3 +161,11 @@ def test_names_tell_lidars_where_they_do_at_all():
 def test_lidar_of_any_name_is_taken_where_none_is_told(registry):
     known = find_known("own", registry(ENTRY))
     assert known.lidar_names(["mine", "hokuyo"]) == ("mine", "hokuyo-utm-30lx-ew")
+
+
+def test_registry_of_the_guide_is_one(tmp_path):
+    text = (PROJECT / "docs" / "download.md").read_text(encoding="utf-8")
+    (tmp_path / "registry.json").write_text(text.partition("```json\n")[2].partition("```")[0])
+    known = find_known("my-building", tmp_path / "registry.json")
+    assert len(known.sources) == 3
+    assert known.lidar_names(["hokuyo", "my-lidar"]) == ("hokuyo-utm-30lx-ew", "my-lidar")

@@ -122,6 +122,15 @@ def test_all_lidars_may_follow_some_of_them(host, home):
     assert not install(archives_at(host)).changed
 
 
+def test_data_set_of_chosen_files_is_gone_on_with(host, home):
+    known = archives_at(host)
+    assert lidars_of(install(known, only=["hall*"]).data) == [WLR]
+    before = {p.name: p.stat().st_ino for p in data_folder(known).glob("sequences/*")}
+    assert lidars_of(install(known).data) == [HOKUYO, WLR]
+    after = {p.name: p.stat().st_ino for p in data_folder(known).glob("sequences/*")}
+    assert after.items() > before.items()
+
+
 def test_one_archive_of_several_lidars_gives_those_that_are_wanted(make_host, home, tmp_path):
     folder = tmp_path / "both"
     make_release(folder / "one", scans=4, sessions=("2024-04-04-12-16-41",))
