@@ -25,7 +25,8 @@ from semantic2d_dataset.errors import (
 from semantic2d_dataset.format.container import load_json
 from semantic2d_dataset.format.manifest import publish, read_manifest
 from semantic2d_dataset.format.sequence import SequenceReader
-from semantic2d_dataset.format.splits import BY_LISTS, NONE, SplitScheme, read_scheme, schemes_of
+from semantic2d_dataset.format.split_schemes import schemes_of
+from semantic2d_dataset.format.splits import BY_LISTS, NONE, SplitScheme, read_scheme
 from semantic2d_dataset.format.writing import write_text_atomically
 from semantic2d_dataset.pipeline.seeds import SEQUENCES, SPLITS, Seeds
 from semantic2d_dataset.pipeline.siblings import load_sibling
