@@ -440,7 +440,7 @@ def test_downloaded_data_set_is_listed_loaded_repaired_and_removed(archives, run
     assert run("verify", "d")[0] == 1
     status, out, _ = run("verify", "d", "--repair")
     assert status == 0
-    assert out.splitlines() == [f"{victim}: repaired", f"{folder}: 4 files, no problem(s)"]
+    assert out.splitlines() == [f"{victim}: repaired", f"{folder}: 5 files, no problem(s)"]
     assert json.loads(run("download", "d@1", "--json")[1])["changed"] is False
     status, out, _ = run("remove", "d", "--archives-too")
     assert status == 0

@@ -298,11 +298,18 @@ def find_problems(folder: Path, *, full: bool = False) -> list[Semantic2DError]:
     DatasetNotFoundError, CorruptFileError, FormatVersionError
         If there is no manifest that can be read.
     """
-    return [*check_files(Path(folder), read_manifest(folder), full=full).values()]
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    problems = [*check_files(folder, manifest, full=full).values()]
+    try:
+        check_checksums(folder, _digests(folder, manifest))
+    except ChecksumError as err:
+        problems.append(err)
+    return problems
 
 
 def check_files(folder: Path, manifest: Manifest, *, full: bool) -> dict[str, Semantic2DError]:
-    """Return what `find_problems` finds, by file, where the manifest may lie elsewhere."""
+    """Return what is wrong with the files of a manifest, by file; it may lie elsewhere."""
     problems: dict[str, Semantic2DError] = {}
     bar = tqdm(manifest.files, desc="verifying", unit="file", disable=None, leave=False)
     for entry in bar:
@@ -310,10 +317,6 @@ def check_files(folder: Path, manifest: Manifest, *, full: bool) -> dict[str, Se
             _verify(folder, manifest, entry, full=full)
         except Semantic2DError as err:
             problems[entry.file] = err
-    try:
-        check_checksums(folder, _digests(folder, manifest))
-    except ChecksumError as err:
-        problems[CHECKSUMS_NAME] = err
     return problems
 
 
