@@ -1,13 +1,16 @@
 """Fixtures for tests that install data sets from a host on this machine."""
 
+import shutil
 from types import SimpleNamespace
 
 import pytest
 
 from semantic2d_dataset.access import web
 from semantic2d_dataset.access.places import HOME_VARIABLE, OFFLINE_VARIABLE
+from semantic2d_dataset.access.registry import open_dataset
+from semantic2d_dataset.pipeline.installation import install
 from tests.access.hosts import Host
-from tests.pipeline.published import pack_archives
+from tests.pipeline.published import archives_at, pack_archives
 
 
 @pytest.fixture
@@ -43,3 +46,24 @@ def archives(tmp_path_factory):
 def host(make_host, archives):
     """Serves two archives of the published layout, and one of raw bags."""
     return make_host(archives)
+
+
+@pytest.fixture(scope="session")
+def installed_once(archives, tmp_path_factory):
+    """A home with the data set of these archives."""
+    home = tmp_path_factory.mktemp("installed")
+    host = Host(archives)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(HOME_VARIABLE, str(home))
+        patch.setenv("NO_PROXY", "127.0.0.1")
+        patch.delenv(OFFLINE_VARIABLE, raising=False)
+        install(archives_at(host))
+    host.close()
+    return home
+
+
+@pytest.fixture
+def installed(installed_once, home):
+    """The data set of these archives, which are kept, in the home of this test."""
+    shutil.copytree(installed_once, home)
+    return open_dataset("d@1")

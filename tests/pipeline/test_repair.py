@@ -46,25 +46,28 @@ def registry(host, tmp_path):
 
 
 def states_of(data):
-    return {e.file: (data.root / e.file).stat().st_ino for e in data.manifest.files}
+    """What tells a file from one that took its place, which may get its inode's number."""
+    states = {e.file: (data.root / e.file).stat() for e in data.manifest.files}
+    return {name: (state.st_ino, state.st_mtime_ns) for name, state in states.items()}
 
 
 @pytest.mark.parametrize("harm", HARM)
-def test_converted_sequence_is_converted_again_and_no_other(harm, host, home, registry):
-    data = install(archives_at(host)).data
-    before, victim = states_of(data), data.manifest.sequences[0].file
-    HARM[harm](data.root / victim)
+def test_converted_sequence_is_converted_again_and_no_other(harm, installed, host, registry):
+    before, victim = states_of(installed), installed.manifest.sequences[0].file
+    HARM[harm](installed.root / victim)
     asked = len(host.offsets)
-    assert repair(data.root, registry=registry) == [victim]
-    again = open_dataset(data.root)
-    assert find_problems(data.root, full=True) == []
-    assert again.manifest.sequences[0].content_digest == data.manifest.sequences[0].content_digest
-    assert again.manifest.sequences[1:] == data.manifest.sequences[1:]
-    assert again.manifest.splits == data.manifest.splits
+    assert repair(installed.root, registry=registry) == [victim]
+    again = open_dataset(installed.root)
+    assert find_problems(installed.root, full=True) == []
+    assert (
+        again.manifest.sequences[0].content_digest == installed.manifest.sequences[0].content_digest
+    )
+    assert again.manifest.sequences[1:] == installed.manifest.sequences[1:]
+    assert again.manifest.splits == installed.manifest.splits
     after = states_of(again)
     assert {name for name in after if after[name] != before[name]} == {victim}
     assert len(host.offsets) == asked  # the archive was kept
-    assert sorted(p.name for p in (home / "datasets").iterdir()) == [".d-1.lock", "d-1"]
+    assert sorted(p.name for p in installed.root.parent.iterdir()) == [".d-1.lock", "d-1"]
 
 
 def test_archive_that_was_not_kept_is_fetched_for_repair_and_not_kept_again(host, home, registry):
@@ -79,59 +82,54 @@ def test_archive_that_was_not_kept_is_fetched_for_repair_and_not_kept_again(host
     assert not list(download_folder(known).glob("[!.]*"))
 
 
-def test_archive_that_is_damaged_too_is_fetched_again(host, home, registry):
+def test_archive_that_is_damaged_too_is_fetched_again(installed, host, registry):
     known = archives_at(host)
-    data = install(known).data
-    flip(data.root / data.manifest.sequences[0].file)
+    flip(installed.root / installed.manifest.sequences[0].file)
     flip(download_folder(known) / "hall.tar.gz")
-    repair(data.root, registry=registry)
-    assert find_problems(data.root, full=True) == []
+    repair(installed.root, registry=registry)
+    assert find_problems(installed.root, full=True) == []
 
 
 @pytest.mark.parametrize("scheme", ["block", "frame"])
 @pytest.mark.parametrize("harm", ["flipped", "missing"])
-def test_split_is_made_again_as_it_was(scheme, harm, host, home, registry):
-    data = install(archives_at(host)).data
-    before = data.scheme(scheme).digest
-    HARM[harm](data.root / f"splits/{scheme}.h5")
-    assert repair(data.root, registry=registry) == [f"splits/{scheme}.h5"]
-    again = open_dataset(data.root)
+def test_split_is_made_again_as_it_was(scheme, harm, installed, host, registry):
+    before = installed.scheme(scheme).digest
+    HARM[harm](installed.root / f"splits/{scheme}.h5")
+    assert repair(installed.root, registry=registry) == [f"splits/{scheme}.h5"]
+    again = open_dataset(installed.root)
     assert again.scheme(scheme).digest == before
-    assert again.manifest.sequences == data.manifest.sequences
-    assert find_problems(data.root, full=True) == []
+    assert again.manifest.sequences == installed.manifest.sequences
+    assert find_problems(installed.root, full=True) == []
 
 
 @pytest.mark.parametrize("harm", [*HARM, "edited"])
-def test_manifest_is_had_again_from_its_copy(harm, host, home, registry):
-    data = install(archives_at(host)).data
-    path = data.root / "dataset.json"
+def test_manifest_is_had_again_from_its_copy(harm, installed, host, registry):
+    path = installed.root / "dataset.json"
     before = path.read_bytes()
     if harm == "edited":
         path.write_bytes(before.replace(b"CC0-1.0", b"CC1-1.0"))
     else:
         HARM[harm](path)
-    assert repair(data.root, registry=registry) == ["dataset.json"]
+    assert repair(installed.root, registry=registry) == ["dataset.json"]
     assert path.read_bytes() == before
 
 
-def test_everything_may_be_damaged_at_once(host, home, registry):
-    data = install(archives_at(host)).data
-    for entry in data.manifest.files:
-        flip(data.root / entry.file)
-    (data.root / "dataset.json").write_text("{")
-    assert len(repair(data.root, registry=registry)) == len(data.manifest.files) + 1
-    again = open_dataset(data.root)
+def test_everything_may_be_damaged_at_once(installed, host, registry):
+    for entry in installed.manifest.files:
+        flip(installed.root / entry.file)
+    (installed.root / "dataset.json").write_text("{")
+    assert len(repair(installed.root, registry=registry)) == len(installed.manifest.files) + 1
+    again = open_dataset(installed.root)
     assert [e.content_digest for e in again.manifest.sequences] == [
-        e.content_digest for e in data.manifest.sequences
+        e.content_digest for e in installed.manifest.sequences
     ]
-    assert find_problems(data.root, full=True) == []
+    assert find_problems(installed.root, full=True) == []
 
 
-def test_whole_data_set_is_left_as_it_is(host, home, registry):
-    data = install(archives_at(host)).data
-    before = {p: p.stat().st_mtime_ns for p in data.root.rglob("*")}
-    assert repair(data.root, registry=registry) == []
-    assert {p: p.stat().st_mtime_ns for p in data.root.rglob("*")} == before
+def test_whole_data_set_is_left_as_it_is(installed, host, registry):
+    before = {p: p.stat().st_mtime_ns for p in installed.root.rglob("*")}
+    assert repair(installed.root, registry=registry) == []
+    assert {p: p.stat().st_mtime_ns for p in installed.root.rglob("*")} == before
 
 
 @pytest.mark.parametrize("harm", HARM)
@@ -225,11 +223,10 @@ def test_repair_that_fails_changes_nothing(host, home, registry):
     assert find_problems(data.root, full=True) == []
 
 
-def test_repair_of_a_data_set_that_no_registry_knows_says_so(host, home, tmp_path):
-    data = install(archives_at(host)).data
-    flip(data.root / data.manifest.sequences[0].file)
+def test_repair_of_a_data_set_that_no_registry_knows_says_so(installed):
+    flip(installed.root / installed.manifest.sequences[0].file)
     with pytest.raises(Semantic2DError, match="d@1: not a known data set"):
-        repair(data.root)
+        repair(installed.root)
 
 
 def test_data_set_in_a_chosen_folder_is_repaired_there(host, home, registry, tmp_path):
@@ -240,13 +237,12 @@ def test_data_set_in_a_chosen_folder_is_repaired_there(host, home, registry, tmp
     assert not data_folder(archives_at(host)).exists()
 
 
-def test_record_that_is_damaged_is_no_help(host, home, registry):
-    data = install(archives_at(host)).data
-    (data.root / ".installed.json").write_text("{")
-    assert repair(data.root, registry=registry) == []
-    flip(data.root / data.manifest.sequences[0].file)
+def test_record_that_is_damaged_is_no_help(installed, host, registry):
+    (installed.root / ".installed.json").write_text("{")
+    assert repair(installed.root, registry=registry) == []
+    flip(installed.root / installed.manifest.sequences[0].file)
     with pytest.raises(DatasetNotFoundError, match="not installed from a registry"):
-        repair(data.root, registry=registry)
+        repair(installed.root, registry=registry)
 
 
 def test_lidars_that_were_not_chosen_are_not_added_by_repair(host, home, registry):
