@@ -427,7 +427,7 @@ def test_downloaded_data_set_is_listed_loaded_repaired_and_removed(archives, run
     assert (status, "get it with: semantic2d download d@1" in err) == (1, True)
     status, out, _ = run("download", "d", "--version", "1", "--lidar", "hokuyo")
     assert status == 0
-    assert out.splitlines()[-1].startswith(f"{folder}: 1 sequences, 6 scans of {HOKUYO}, 0.")
+    assert out.splitlines()[-1].startswith(f"{folder}: 1 sequence, 6 scans of {HOKUYO}, 0.")
     with pytest.raises(DatasetNotFoundError, match="semantic2d download d@1 --lidar wlr716"):
         load_dataset("d", lidar="wlr716", split=None)
     scans = load_dataset("d", lidar="wlr716", split=None, download=True)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Never
 
 import requests
-from filelock import FileLock
 from tqdm import tqdm
 
 from semantic2d_dataset.access.file_lists import Locations, check_files
@@ -30,6 +28,7 @@ from semantic2d_dataset.errors import (
     WriteError,
 )
 from semantic2d_dataset.format.container import load_json
+from semantic2d_dataset.format.locks import alone
 from semantic2d_dataset.format.writing import write_text_atomically
 
 LIST_NAME = ".files.json"
@@ -298,23 +297,12 @@ def _check_space(folder: Path, missing: Iterable[RemoteFile]) -> None:
         )
 
 
-@contextlib.contextmanager
-def _locked(target: Path) -> Iterator[None]:
-    lock = FileLock(target.with_name(f".{target.name}.lock"))
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError, NotImplementedError):  # where there are no locks
-            lock.acquire()
-            stack.callback(lock.release)
-        yield
-
-
 def _fetch_once(
     session: requests.Session, file: RemoteFile, folder: Path, locations: Locations
 ) -> None:
     """Get a file unless another process just did."""
     target = folder / file.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(target):  # saves work; that partial files have names of their own keeps it right
+    with alone(target):  # saves work; that partial files have names of their own keeps it right
         if not _is_there(folder, file):
             _fetch(session, file, target, locations.of(file))
 

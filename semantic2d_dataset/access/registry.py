@@ -6,8 +6,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from filelock import FileLock
-
 from semantic2d_dataset.access.installed import (
     datasets_home,
     find_installed,
@@ -16,6 +14,7 @@ from semantic2d_dataset.access.installed import (
     write_record,
 )
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
+from semantic2d_dataset.format.locks import alone
 from semantic2d_dataset.format.manifest import (
     MANIFEST_NAME,
     Manifest,
@@ -173,9 +172,7 @@ def find_folder(
 def _find_mini() -> Path:
     folder = datasets_home() / f"{MINI}-{MINI_VERSION}"
     if not is_complete(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        # the lock saves work; it is the renaming that keeps it right
-        with FileLock(folder.with_name(f".{folder.name}.lock")):
+        with alone(folder):  # saves work; it is the renaming that keeps it right
             if not is_complete(folder):
                 make_folder(folder, make_mini_whole, lambda: is_complete(folder))
     return folder

@@ -181,6 +181,17 @@ def write_digests(folder: Path, manifest: Manifest) -> None:
     write_checksums(Path(folder), _digests(Path(folder), manifest))
 
 
+def check_digests(folder: Path, manifest: Manifest) -> None:
+    """Check that ``SHA256SUMS``, where there is one, is what `write_digests` writes.
+
+    Raises
+    ------
+    ChecksumError
+        If it is not.
+    """
+    check_checksums(Path(folder), _digests(Path(folder), manifest))
+
+
 def describe_document(folder: Path, name: str) -> FileEntry:
     """Return the entry of a file about the data, by its relative name."""
     return FileEntry(name, *size_and_digest(Path(folder) / name))
@@ -302,7 +313,7 @@ def find_problems(folder: Path, *, full: bool = False) -> list[Semantic2DError]:
     manifest = read_manifest(folder)
     problems = [*check_files(folder, manifest, full=full).values()]
     try:
-        check_checksums(folder, _digests(folder, manifest))
+        check_digests(folder, manifest)
     except ChecksumError as err:
         problems.append(err)
     return problems

@@ -28,9 +28,10 @@ from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.format.split_schemes import schemes_of
 from semantic2d_dataset.format.splits import BY_LISTS, NONE, SplitScheme, read_scheme
 from semantic2d_dataset.format.writing import write_text_atomically
-from semantic2d_dataset.pipeline.seeds import SEQUENCES, SPLITS, Seeds
+from semantic2d_dataset.pipeline.seeds import Seeds
 from semantic2d_dataset.pipeline.siblings import load_sibling
 from semantic2d_dataset.pipeline.staging import link
+from semantic2d_dataset.publishing.staging import SEQUENCES, SPLITS
 
 _FRAME = "frame"
 _MARK = "part.json"

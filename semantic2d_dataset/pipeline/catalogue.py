@@ -11,8 +11,9 @@ from semantic2d_dataset.access.installed import datasets_home, installed, is_ins
 from semantic2d_dataset.access.known_datasets import KnownDataset, find_known, known_datasets
 from semantic2d_dataset.access.places import home
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError, Semantic2DError
+from semantic2d_dataset.format.locks import alone
 from semantic2d_dataset.format.manifest import read_manifest
-from semantic2d_dataset.pipeline.staging import alone, discard, left_of, size_of, tidy
+from semantic2d_dataset.pipeline.staging import discard, left_of, size_of, tidy
 
 
 def list_datasets(registry: Path | str | None = None) -> list[dict[str, Any]]:

@@ -22,11 +22,12 @@ from semantic2d_dataset.access.installed import (
 from semantic2d_dataset.access.known_datasets import PROCESSED, KnownDataset, RemoteFile
 from semantic2d_dataset.access.registry import OpenDataset, open_dataset
 from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.format.locks import alone
 from semantic2d_dataset.format.manifest import check_names, read_manifest
 from semantic2d_dataset.pipeline.archives import Converter
 from semantic2d_dataset.pipeline.published import Fetcher, is_published_as_data_set
 from semantic2d_dataset.pipeline.seeds import seeds_of
-from semantic2d_dataset.pipeline.staging import Staging, alone, tidy
+from semantic2d_dataset.pipeline.staging import Staging, tidy
 
 _ARCHIVES = "archives"
 
@@ -228,10 +229,12 @@ def describe(known: KnownDataset, done: Installation) -> dict[str, Any]:
 
 def format_description(said: Mapping[str, Any]) -> str:
     """Return what `describe` says as text."""
+    count = said["sequences"]
+    sequences = f"{count} {'sequence' if count == 1 else 'sequences'}"
     kept = f"archives are kept in {said['archives']}\n" if said["archives"] else ""
     return (
         f"{said['dataset']}: {said['title']}\nlicense: {said['license']}\n{kept}"
-        f"{said['folder']}: {'' if said['changed'] else 'was there; '}{said['sequences']} "
-        f"sequences, {said['scans']:,} scans of {', '.join(said['lidars'])}, "
+        f"{said['folder']}: {'' if said['changed'] else 'was there; '}{sequences}, "
+        f"{said['scans']:,} scans of {', '.join(said['lidars'])}, "
         f"{said['bytes'] / 1e6:,.1f} MB"
     )

@@ -21,8 +21,8 @@ from semantic2d_dataset.format.manifest import (
     read_manifest,
 )
 from semantic2d_dataset.format.splits import SplitScheme, read_scheme
-from semantic2d_dataset.pipeline.seeds import SEQUENCES, SPLITS
 from semantic2d_dataset.pipeline.staging import link
+from semantic2d_dataset.publishing.staging import SEQUENCES, SPLITS
 
 
 def is_published_as_data_set(files: Sequence[RemoteFile]) -> bool:

@@ -11,12 +11,16 @@ from semantic2d_dataset.access.installed import Part, Record, read_record, write
 from semantic2d_dataset.access.known_datasets import KnownDataset, RemoteFile, find_known
 from semantic2d_dataset.access.registry import make_mini_whole
 from semantic2d_dataset.errors import ChecksumError, DatasetNotFoundError, Semantic2DError
+from semantic2d_dataset.format.checksums import CHECKSUMS_NAME
+from semantic2d_dataset.format.locks import alone
 from semantic2d_dataset.format.manifest import (
     MANIFEST_NAME,
     Manifest,
+    check_digests,
     check_files,
     find_problems,
     read_manifest,
+    write_digests,
     write_manifest,
 )
 from semantic2d_dataset.format.splits import read_scheme
@@ -25,7 +29,7 @@ from semantic2d_dataset.pipeline.archives import Converter
 from semantic2d_dataset.pipeline.installation import archives_folder, full_version
 from semantic2d_dataset.pipeline.published import Fetcher, is_published_as_data_set
 from semantic2d_dataset.pipeline.seeds import seeds_of
-from semantic2d_dataset.pipeline.staging import Staging, alone, link
+from semantic2d_dataset.pipeline.staging import Staging, link
 
 _OTHER_DATA = (
     "holds other data than it did; another version of the package may have made it: remove the "
@@ -82,7 +86,12 @@ def repair(folder: Path, *, registry: Path | str | None = None, offline: bool = 
                 raise problem
             write_record(staging.data, record.dataset, record.lidars, parts)
             staging.publish(lambda: False)
-        return [*damaged, *([] if told else [MANIFEST_NAME])]
+        # without a record, nothing says whether the manifest or the list of digests was changed
+        lists_others = record is not None and _lists_others(folder)
+        if lists_others:
+            write_digests(folder, read_manifest(folder))
+        manifests = [] if told else [MANIFEST_NAME]
+        return [*damaged, *manifests, *([CHECKSUMS_NAME] if lists_others else [])]
 
 
 def _manifest_of(folder: Path, record: Record | None, told: Path) -> Manifest:
@@ -109,6 +118,15 @@ def _is_told(folder: Path, record: Record | None) -> bool:
         return record is None or (folder / MANIFEST_NAME).read_text("utf-8") == record.manifest
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def _lists_others(folder: Path) -> bool:
+    """Tell whether ``SHA256SUMS`` is there and is not that of the manifest."""
+    try:
+        check_digests(folder, read_manifest(folder))
+    except ChecksumError:
+        return True
+    return False
 
 
 def _make_again(
@@ -152,6 +170,20 @@ def _keep_good(
     folder: Path, data: Path, manifest: Manifest, record: Record, damaged: Collection[str]
 ) -> None:
     """Leave what is good the same to the byte, and check that the rest holds what it held."""
+    kept = _merge(folder, data, manifest, record, damaged)
+    for file in kept.files:
+        if file.file not in damaged:
+            link(folder / file.file, data / file.file)
+    if kept == manifest:  # as it was published, to the byte, which its SHA256SUMS lists
+        write_text_atomically(data / MANIFEST_NAME, record.manifest)
+    else:
+        write_manifest(data, kept)
+
+
+def _merge(
+    folder: Path, data: Path, manifest: Manifest, record: Record, damaged: Collection[str]
+) -> Manifest:
+    """Return the manifest with the entries of what was made again, which must hold the same."""
     made = read_manifest(data)
     sequences, splits = {e.id: e for e in manifest.sequences}, dict(manifest.splits)
     if sequences.keys() != made.lengths.keys() or splits.keys() != made.splits.keys():
@@ -167,8 +199,4 @@ def _keep_good(
             raise ChecksumError(f"{data / split.file}: {_OTHER_DATA}")
         if split.file in damaged:
             splits[name] = split
-    kept = replace(manifest, sequences=tuple(sequences.values()), splits=splits)
-    for file in kept.files:
-        if file.file not in damaged:
-            link(folder / file.file, data / file.file)
-    write_manifest(data, kept)
+    return replace(manifest, sequences=tuple(sequences.values()), splits=splits)

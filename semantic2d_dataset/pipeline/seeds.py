@@ -10,8 +10,8 @@ from semantic2d_dataset.access.installed import Part, Record, read_record
 from semantic2d_dataset.errors import ChecksumError, Semantic2DError
 from semantic2d_dataset.format.manifest import Manifest, read_manifest
 from semantic2d_dataset.format.splits import BY_LISTS, SplitScheme, read_scheme
+from semantic2d_dataset.publishing.staging import SPLITS
 
-SEQUENCES, SPLITS = "sequences", "splits"
 _FRAME = "frame"
 
 

@@ -11,14 +11,10 @@ import glob
 import os
 import shutil
 import socket
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
-
-from filelock import FileLock, Timeout
-from tqdm import tqdm
 
 from semantic2d_dataset.errors import WriteError
 from semantic2d_dataset.format.writing import partial_name, stale_partials
@@ -109,22 +105,6 @@ class Staging:
     def _drop(self) -> None:
         with contextlib.suppress(FileNotFoundError):
             _remove(self.path, self.target)
-
-
-@contextlib.contextmanager
-def alone(target: Path) -> Iterator[None]:
-    """Wait for other processes that work on a folder, where there are locks."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(target.with_name(f".{target.name}.lock"))
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError, NotImplementedError):  # where there are no locks
-            try:
-                lock.acquire(timeout=0)
-            except Timeout:
-                tqdm.write(f"{target}: another process is at work; waiting", file=sys.stderr)
-                lock.acquire()
-            stack.callback(lock.release)
-        yield
 
 
 def left_of(target: Path) -> list[Path]:

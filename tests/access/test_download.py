@@ -30,6 +30,7 @@ from semantic2d_dataset.errors import (
     OfflineError,
     WriteError,
 )
+from semantic2d_dataset.format import locks
 from tests.access import hosts
 from tests.access.hosts import make_bytes, md5
 
@@ -337,11 +338,11 @@ def get(host_url, folder):
         def __init__(self, path):
             pass
 
-        def acquire(self):
+        def acquire(self, **_):
             raise NotImplementedError
 
     os.environ["NO_PROXY"] = "127.0.0.1"
-    module.FileLock = NoLock  # as on file systems that have none
+    locks.FileLock = NoLock  # as on file systems that have none
     source = ZenodoRecord("7", host_url)
     download(KnownDataset("d", "1", "D", "unknown", (source,)), folder)
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from semantic2d_dataset.access import registry
 from semantic2d_dataset.access.places import HOME_VARIABLE, home
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.errors import (
@@ -13,6 +12,7 @@ from semantic2d_dataset.errors import (
     InvalidInputError,
     Semantic2DError,
 )
+from semantic2d_dataset.format import locks
 from semantic2d_dataset.format.writing import make_folder
 from tests.generators import SMALL_LIDAR, make_dataset, make_sequence
 
@@ -77,7 +77,7 @@ def test_interrupted_making_leaves_nothing(small_home, monkeypatch):
 
 
 def open_in_child(queue):
-    registry.FileLock = NoLock  # as on file systems where locks do nothing
+    locks.FileLock = NoLock  # as on file systems where locks do nothing
     from semantic2d_dataset.simulation import mini
 
     mini.make_mini = make_small
@@ -88,11 +88,8 @@ class NoLock:
     def __init__(self, path: Path) -> None:
         pass
 
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: object) -> None:
-        pass
+    def acquire(self, **_: object) -> None:
+        raise NotImplementedError
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(8, marks=pytest.mark.long)])

@@ -27,8 +27,8 @@ from semantic2d_dataset.errors import (
     RecordingError,
     WriteError,
 )
+from semantic2d_dataset.format import locks
 from semantic2d_dataset.format.manifest import find_problems
-from semantic2d_dataset.pipeline import staging as staging_module
 from semantic2d_dataset.pipeline.archives import Converter
 from semantic2d_dataset.pipeline.installation import full_version, install
 from tests.access import hosts
@@ -366,9 +366,7 @@ def run_without_locks(registry, home, options):
         def acquire(self, **_):
             raise NotImplementedError
 
-    from semantic2d_dataset.access import download
-
-    download.FileLock = staging_module.FileLock = NoLock
+    locks.FileLock = NoLock
     run_install(registry, home, None, options)
 
 

@@ -18,6 +18,7 @@ from semantic2d_dataset.errors import (
 from semantic2d_dataset.format.manifest import find_problems, publish
 from semantic2d_dataset.pipeline.installation import install
 from semantic2d_dataset.pipeline.repair import repair
+from semantic2d_dataset.publishing.release import release
 from tests.access import hosts
 from tests.generators import make_dataset, make_sequence
 from tests.pipeline.published import archives_at, files_at, files_in, write_registry
@@ -149,6 +150,24 @@ def test_file_of_a_published_data_set_is_fetched_again_and_no_other(
     assert open_dataset(data.root) == data
     fetched = [path.removeprefix("/files/") for path, *_ in host.requests[asked:]]
     assert sorted(fetched) == victims
+
+
+@pytest.mark.parametrize(
+    "victims", [["DATASET_CARD.md"], ["splits/block.h5"], ["SHA256SUMS"], ["dataset.json"]]
+)
+def test_released_data_set_is_repaired_to_the_byte(victims, make_host, home, tmp_path, monkeypatch):
+    make_dataset(tmp_path / "there", scans=20)
+    release(tmp_path / "there", version="1.0.0", license="CC0-1.0")
+    published = files_in(tmp_path / "there")
+    known = files_at(make_host(published))
+    monkeypatch.setattr("semantic2d_dataset.pipeline.repair.find_known", lambda *_: known)
+    data = install(known).data
+    for victim in victims:
+        flip(data.root / victim)
+    assert repair(data.root) == victims
+    assert find_problems(data.root, full=True) == []
+    now = files_in(data.root)
+    assert {name: now[name] for name in published} == published
 
 
 @pytest.fixture
