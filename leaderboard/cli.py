@@ -2,17 +2,157 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from leaderboard.cli_private import app as private_app
+from semantic2d_dataset.cli_options import AsJson
+from semantic2d_dataset.errors import InvalidInputError
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None)
+app.add_typer(private_app, name="private")
+
+_Entries = Annotated[Path, typer.Option("--entries", help="Folder of the board's entries.")]
+_Data = Annotated[
+    list[str] | None,
+    typer.Option("--data", help="Data set folder or name to check against; may be repeated."),
+]
+_Predictions = Annotated[
+    Path | None,
+    typer.Option("--predictions", help="Folder of predictions files; found by their digests."),
+]
+_ENTRIES = Path("leaderboard/entries")
 
 
 @app.callback()
 def leaderboard() -> None:
-    """Rank methods by their results."""
+    """Keep a board of methods: add entries, check them, build its pages."""
+
+
+@app.command()
+def add(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    *,
+    entries: _Entries = _ENTRIES,
+    data: Annotated[
+        str | None, typer.Option(help="Data set folder or name; else as the file says.")
+    ] = None,
+    scheme: Annotated[str | None, typer.Option(help="Split scheme; else as it says.")] = None,
+    split: Annotated[str | None, typer.Option(help="Split; else as the file says.")] = None,
+    url: Annotated[
+        str | None, typer.Option(help="Where others get this very file (https).")
+    ] = None,
+    sanity_row: Annotated[
+        bool, typer.Option("--sanity", help="A row to compare with, not to rank.")
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace this method's earlier entry.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Score predictions, and write their entry."""
+    from leaderboard.adding import add_entry, make_entry
+    from leaderboard.entries import SANITY, SCORED
+    from semantic2d_dataset.access.registry import open_dataset
+    from semantic2d_dataset.scoring.metrics import percent
+    from semantic2d_dataset.scoring.predictions import PredictionsReader
+
+    if not entries.is_dir():
+        raise InvalidInputError(f"{entries}: no such folder; make it, or say another --entries")
+    with PredictionsReader(predictions) as reader:
+        name = data or reader.dataset
+    if not name:
+        raise InvalidInputError(f"{predictions}: does not name its data set; say it with --data")
+    kind = SANITY if sanity_row else SCORED
+    entry = make_entry(
+        predictions, open_dataset(name), kind=kind, url=url, scheme=scheme, split=split
+    )
+    path = add_entry(entry, entries, force=force)
+    result = entry["result"]
+    said = {"entry": str(path), "mIoU": result["mIoU"], "mCA": result["mCA"]}
+    text = f"{path}: mIoU {percent(result['mIoU'])}, mCA {percent(result['mCA'])}"
+    typer.echo(json.dumps(said, indent=1) if as_json else text)
+
+
+@app.command()
+def check(
+    *,
+    entries: _Entries = _ENTRIES,
+    data: _Data = None,
+    predictions: _Predictions = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check every entry: digests, figures, and the score again where predictions are at hand."""
+    from leaderboard.checking import WRONG, AtHand, check_entries, format_check
+
+    found = check_entries(entries, AtHand(data or (), _folder(predictions)))
+    if as_json:
+        said = [
+            {
+                "entry": each.path.name,
+                "status": each.status,
+                "reason": each.reason,
+                "problems": [{"field": name, "problem": what} for name, what in each.problems],
+            }
+            for each in found
+        ]
+        typer.echo(json.dumps(said, indent=1))
+    else:
+        typer.echo(format_check(found) or f"{entries}: no entries")
+    if any(each.status == WRONG for each in found):
+        raise typer.Exit(1)
+
+
+@app.command()
+def build(
+    out: Annotated[Path, typer.Argument(help="Folder of the pages; an earlier one is replaced.")],
+    *,
+    entries: _Entries = _ENTRIES,
+    data: _Data = None,
+    predictions: _Predictions = None,
+) -> None:
+    """Write the pages of the board: a folder that any web server can show, or none."""
+    from leaderboard.checking import AtHand
+    from leaderboard.site import build_site
+
+    count = build_site(out, entries, AtHand(data or (), _folder(predictions)))
+    typer.echo(f"wrote {out / 'index.html'}: {count} entries")
+
+
+@app.command()
+def published(*, entries: _Entries = _ENTRIES) -> None:
+    """Write the rows of the published table as entries, marked as published."""
+    from leaderboard.adding import add_entry
+    from leaderboard.published import published_entries
+
+    if not entries.is_dir():
+        raise InvalidInputError(f"{entries}: no such folder; make it, or say another --entries")
+    paths = [add_entry(entry, entries, force=True) for entry in published_entries()]
+    typer.echo(f"wrote {len(paths)} entries into {entries}")
+
+
+@app.command()
+def sanity(
+    kind: Annotated[str, typer.Argument(help="majority or perfect.")],
+    out: Annotated[Path, typer.Option("--out", help="Predictions file to write.")],
+    *,
+    data: Annotated[str, typer.Option(help="Data set folder or name.")] = "semantic2d-mini",
+    lidar: Annotated[str, typer.Option(help="Whose scans to label.")] = "hokuyo",
+    scheme: Annotated[str, typer.Option(help="How the data set is divided.")] = "block",
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    force: Annotated[bool, typer.Option("--force", help="Replace the file --out.")] = False,
+) -> None:
+    """Write predictions to compare with: the majority class, or the truth itself."""
+    from leaderboard.sanity import predict_sanity
+    from semantic2d_dataset.access.registry import open_dataset
+    from semantic2d_dataset.format.writing import check_target
+
+    check_target(out, (), force=force)
+    predict_sanity(kind, open_dataset(data), out, lidar=lidar, scheme=scheme, split=split)
+    typer.echo(f"wrote {out}; add it with: semantic2d leaderboard add {out} --sanity")
 
 
 @app.command()
@@ -22,9 +162,7 @@ def table(
     ],
     *,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a Markdown table.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON for a program to read.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print a table of results, best mIoU first."""
     from leaderboard.table import rank, to_json, to_markdown, to_text
@@ -33,3 +171,9 @@ def table(
         raise typer.BadParameter("choose one of --markdown and --json")
     layout = to_markdown if markdown else to_json if as_json else to_text
     typer.echo(layout(rank(results)))
+
+
+def _folder(predictions: Path | None) -> Path | None:
+    if predictions is not None and not predictions.is_dir():
+        raise InvalidInputError(f"{predictions}: expected a folder of predictions files")
+    return predictions

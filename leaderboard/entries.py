@@ -1,0 +1,249 @@
+"""Entries of the board: one method on one track, with the digests of all that its figures rest on.
+
+An entry is a JSON file. Its ``seals`` are short checksums of its parts: they tell which part a
+slip or an edit has changed. They are no signature; what proves an entry is scoring its
+predictions again (`leaderboard.checking`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+
+from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
+from semantic2d_dataset.format.container import check_version, load_json
+from semantic2d_dataset.format.sequence import slug
+from semantic2d_dataset.scene.taxonomy import Taxonomy
+from semantic2d_dataset.scoring.metrics import Evaluator
+
+FORMAT = "semantic2d-leaderboard-entry"
+FORMAT_VERSION = "1.0"
+SCORED, SANITY, PUBLISHED = "scored", "sanity", "published"
+
+_MAX_BYTES = 1 << 24
+_NUMBERS = re.compile(r"\[\n(?:\s*-?[0-9][0-9.e+-]*,?\n)+\s*\]")  # no text holds a line break
+_SEALED = ("track", "metadata", "digests", "taxonomy", "source", "figures", "result")
+
+
+@dataclass(frozen=True, order=True)
+class Track:
+    """What can be ranked together: one lidar on one split, scored by one evaluator.
+
+    The digests are those of the split scheme and of the classes; empty, as is the evaluator's
+    version, for figures that were only published.
+    """
+
+    dataset: str
+    dataset_version: str
+    scheme: str
+    split: str
+    lidar: str
+    evaluator_version: str = ""
+    split_digest: str = ""
+    taxonomy_digest: str = ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry.
+
+    Parameters
+    ----------
+    path
+        Its file; the name follows from what it says, see `file_name`.
+    said
+        The JSON document.
+    """
+
+    path: Path
+    said: Mapping[str, Any]
+
+    @property
+    def kind(self) -> str:
+        """``scored``, ``sanity`` or ``published``."""
+        return str(self.said["kind"])
+
+    @property
+    def method(self) -> str:
+        """Name of the method, with the letters of its features where it says them."""
+        return name_of(self.said["metadata"])
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the predictions, "" for what was only published."""
+        return str(self.said.get("digests", {}).get("predictions", ""))
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The classes."""
+        return taxonomy_of(self.said)
+
+    def tracks(self) -> Iterator[Track]:
+        """Yield the track of each lidar that was predicted."""
+        said, digests = self.said["track"], self.said.get("digests", {})
+        for lidar in said["lidars"]:
+            yield Track(
+                said["dataset"],
+                said["dataset_version"],
+                said["scheme"],
+                said["split"],
+                lidar,
+                self.said.get("evaluator_version", ""),
+                digests.get("split", ""),
+                digests.get("taxonomy", ""),
+            )
+
+
+def name_of(metadata: Mapping[str, Any]) -> str:
+    """Return a method's name, with its features: two sets of features are two methods."""
+    method, features = str(metadata["method"]), features_of(metadata)
+    return f"{method} ({features})" if features and features not in method.split() else method
+
+
+def features_of(metadata: Mapping[str, Any]) -> str:
+    """Return the letters of the features that a method was given, "" where it does not say."""
+    track = metadata.get("track")
+    said = track.get("features") if isinstance(track, Mapping) else None
+    return str(said or metadata.get("features", ""))
+
+
+def file_name(said: Mapping[str, Any]) -> str:
+    """Return the name that the file of an entry must have."""
+    track = said["track"]
+    name = name_of(said["metadata"])
+    # names without a Latin letter would all be one file
+    plain = slug(name) if name.isascii() else f"{slug(name)}-{_sha256(name)[:8]}"
+    where = "--".join(
+        (
+            f"{track['dataset']}-{track['dataset_version']}",
+            track["scheme"],
+            track["split"],
+            "-".join(track["lidars"]),
+        )
+    )
+    return f"{where}--{plain[:80]}.json"
+
+
+def taxonomy_of(said: Mapping[str, Any]) -> Taxonomy:
+    """Return the classes that an entry names.
+
+    Raises
+    ------
+    InvalidInputError
+        If they are none.
+    """
+    classes = said["taxonomy"]
+    colours = tuple((r, g, b) for r, g, b in classes["colours"])
+    return Taxonomy(tuple(classes["names"]), colours, classes["background_id"])
+
+
+def seal(said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with the seals that belong to it."""
+    parts = {name: value for name, value in said.items() if name != "seals"}
+    return parts | {"seals": seals_of(parts)}
+
+
+def seals_of(said: Mapping[str, Any]) -> dict[str, str]:
+    """Return the checksum of every part by its JSON path: of members, where they are figures."""
+    return {path: _checksum(value) for path, value in sorted(_parts(said))}
+
+
+def schema_problems(said: Any) -> list[tuple[str, str]]:
+    """List where a document is no entry: JSON path, and what is wrong there."""
+    validator = jsonschema.Draft202012Validator(_schema())
+    found = [
+        (error.json_path.removeprefix("$").removeprefix(".") or "the file", _cut(error.message))
+        for error in validator.iter_errors(said)
+    ]
+    if not found and said["kind"] != PUBLISHED:
+        try:
+            Evaluator(taxonomy_of(said))
+        except InvalidInputError as err:
+            found.append(("taxonomy", str(err)))
+    return found
+
+
+def read_entry(path: Path) -> Entry:
+    """Read an entry, and check its form; `leaderboard.checking` checks what it says.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    CorruptFileError
+        If it is not an entry.
+    FormatVersionError
+        If it was written in a newer major format.
+    """
+    path = Path(path)
+    with path.open("rb") as stream:
+        content = stream.read(_MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
+        raise CorruptFileError(f"{path}: larger than {_MAX_BYTES} bytes; no entry is")
+    try:
+        said = load_json(content)
+    except InvalidInputError as err:
+        raise CorruptFileError(f"{path}: {err}") from err
+    if isinstance(said, dict) and isinstance(said.get("format_version"), str):
+        check_version(path, said["format_version"])
+    problems = schema_problems(said)
+    if problems:
+        where, what = problems[0]
+        raise CorruptFileError(f"{path}: not an entry of the leaderboard: {where}: {what}")
+    return Entry(path, said)
+
+
+def list_entries(folder: Path) -> list[Path]:
+    """Return the entry files of a folder, by name.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is no folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InvalidInputError(f"{folder}: expected a folder of entries (*.json)")
+    return sorted(folder.glob("*.json"))
+
+
+def to_json(said: Mapping[str, Any]) -> str:
+    """Return an entry as JSON text, rows of numbers on one line each."""
+    text = json.dumps(said, indent=1, allow_nan=False, ensure_ascii=False)
+    return _NUMBERS.sub(lambda rows: " ".join(rows[0].split()), text) + "\n"
+
+
+def _parts(said: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in said.items():
+        if name not in _SEALED or not isinstance(value, Mapping):
+            yield name, value
+            continue
+        for member, inner in value.items():
+            yield f"{name}.{member}", inner
+
+
+def _checksum(value: Any) -> str:
+    return _sha256(json.dumps(value, sort_keys=True, ensure_ascii=False))[:16]
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _cut(message: str) -> str:
+    return message if len(message) <= 200 else f"{message[:200]} ..."
+
+
+@cache
+def _schema() -> Any:
+    text = resources.files(__package__).joinpath("entry.schema.json").read_text("utf-8")
+    return json.loads(text)

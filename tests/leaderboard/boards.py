@@ -1,0 +1,74 @@
+"""Predictions and entries for tests, made from a small data set."""
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from leaderboard.adding import add_entry, make_entry
+from semantic2d_dataset.access.registry import open_dataset
+from semantic2d_dataset.scoring.predictions import PredictionsWriter
+
+
+def write_predictions(path: Path, folder: Path, *, right=0.5, seed=0, **metadata) -> Path:
+    """Write predictions of the test split of `block` of which a share is right."""
+    data = open_dataset(folder)
+    scheme = data.scheme("block")
+    taxonomy = data.reader(data.manifest.sequences[0].id).header.taxonomy
+    rng = np.random.default_rng(seed)
+    with PredictionsWriter(
+        path,
+        dataset=data.manifest.name,
+        dataset_version=data.manifest.version,
+        scheme="block",
+        split="test",
+        taxonomy=taxonomy,
+        metadata={"method": "Guess"} | metadata,
+    ) as writer:
+        for entry in data.manifest.sequences:
+            indices = scheme.scans_of(entry.id, "test")
+            truth = data.reader(entry.id).read("scans/labels")[indices]
+            noise = rng.integers(0, len(taxonomy), truth.shape).astype(np.uint8)
+            kept = (rng.random(truth.shape) < right) & (truth != 255)
+            writer.add(entry.id, indices, np.where(kept, truth, noise))
+    return path
+
+
+def add(predictions: Path, folder: Path, entries: Path, **options) -> Path:
+    return add_entry(make_entry(predictions, open_dataset(folder), **options), entries)
+
+
+def leaves_of(value: Any, path: tuple = ()) -> Iterator[tuple]:
+    """Yield the way to every value that holds no other."""
+    if not isinstance(value, dict | list):
+        yield path
+        return
+    inner = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, each in inner:
+        yield from leaves_of(each, (*path, key))
+
+
+def edited(said: dict, path: tuple) -> dict:
+    """Return a document with one value changed into another of its kind."""
+    changed = copy.deepcopy(said)
+    owner = changed
+    for key in path[:-1]:
+        owner = owner[key]
+    value = owner[path[-1]]
+    if isinstance(value, str):
+        last = "0" if value[-1] != "0" else "1"
+        owner[path[-1]] = value[:-1] + last
+    elif isinstance(value, int):
+        owner[path[-1]] = value + 1 if value < 200 else value - 1
+    elif value is None:
+        owner[path[-1]] = 0.5
+    else:
+        owner[path[-1]] = value * 0.999 if value else 0.001
+    return changed
+
+
+def json_path(path: tuple) -> str:
+    parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
+    return "".join(parts).removeprefix(".")

@@ -1,0 +1,181 @@
+import json
+import shutil
+
+import pytest
+
+from leaderboard.adding import add_entry
+from leaderboard.checking import (
+    AS_PUBLISHED,
+    UNVERIFIED,
+    VERIFIED,
+    WRONG,
+    AtHand,
+    check_entries,
+    check_entry,
+    format_check,
+)
+from leaderboard.entries import file_name, seal, to_json
+from leaderboard.published import published_entries
+from semantic2d_dataset.errors import InvalidInputError
+from tests.leaderboard.boards import add, edited, json_path, leaves_of, write_predictions
+
+
+@pytest.fixture
+def at_hand(dataset_folder, predictions_folder):
+    return AtHand([str(dataset_folder)], predictions_folder)
+
+
+def one_of(board):
+    path = sorted(board.iterdir())[0]
+    return path, json.loads(path.read_text())
+
+
+def test_entries_whose_predictions_are_at_hand_are_verified(board, at_hand):
+    found = check_entries(board, at_hand)
+    assert [each.status for each in found] == [VERIFIED] * 3
+    assert not any(each.problems for each in found)
+
+
+def test_entries_whose_predictions_or_data_are_not_at_hand_are_unverified(board, dataset_folder):
+    without = check_entries(board, AtHand([str(dataset_folder)]))
+    assert {each.status for each in without} == {UNVERIFIED}
+    assert "its predictions are not at hand" in format_check(without)
+    assert "generated 1.0.0 is not at hand" in format_check(check_entries(board, AtHand()))
+
+
+def test_the_published_rows_are_as_published(tmp_path):
+    for entry in published_entries():
+        add_entry(entry, tmp_path)
+    assert {each.status for each in check_entries(tmp_path, AtHand())} == {AS_PUBLISHED}
+
+
+def assert_every_edit_is_named(path, said, at_hand):
+    for leaf in leaves_of(said):
+        path.write_text(to_json(edited(said, leaf)))
+        found = check_entry(path, at_hand)
+        assert found.status == WRONG, leaf
+        where = json_path(leaf)
+        if leaf[0] == "seals":
+            where = leaf[1]
+        named = [name for name, _ in found.problems]
+        assert any(where.startswith(name) or name == "the file" for name in named), (leaf, named)
+
+
+def test_any_edit_of_any_value_fails_and_is_named_without_predictions(board):
+    assert_every_edit_is_named(*one_of(board), AtHand())
+
+
+def test_any_edit_of_a_published_figure_fails_and_is_named(tmp_path):
+    path = add_entry(list(published_entries())[5], tmp_path)
+    assert_every_edit_is_named(path, json.loads(path.read_text()), AtHand())
+
+
+def test_an_edit_that_is_sealed_again_fails_by_its_own_counts(board):
+    path, said = one_of(board)
+    figures = [leaf for leaf in leaves_of(said["result"]) if leaf[0] != "per_lidar"]
+    assert len(figures) > 140
+    for leaf in figures:
+        path.write_text(to_json(seal(edited(said, ("result", *leaf)))))
+        named = [name for name, _ in check_entry(path, AtHand()).problems]
+        assert f"result.{json_path(leaf)}" in named, leaf
+
+
+@pytest.mark.parametrize("name", ["predictions", "split", "taxonomy"])
+def test_a_digest_that_is_sealed_again_fails_where_things_are_at_hand(board, at_hand, name):
+    path, said = one_of(board)
+    said["digests"][name] = "0" * 64
+    path.write_text(to_json(seal(said)))
+    assert f"digests.{name}" in [field for field, _ in check_entry(path, at_hand).problems]
+
+
+def test_counts_that_agree_with_themselves_fail_against_the_predictions(
+    board, at_hand, dataset_folder, tmp_path
+):
+    """Another method's figures, whole, under this one's digests."""
+    path, said = one_of(board)
+    other = json.loads(sorted(board.iterdir())[1].read_text())
+    said["result"] = other["result"]
+    path.write_text(to_json(seal(said)))
+    assert check_entry(path, AtHand([str(dataset_folder)])).status == UNVERIFIED
+    named = [field for field, _ in check_entry(path, at_hand).problems]
+    assert "result.mIoU" in named
+    assert "result.Chair.iou" in named
+
+
+def test_an_entry_of_an_older_evaluator_is_unverified(board, at_hand):
+    path, said = one_of(board)
+    said["evaluator_version"] = "0.9"
+    path.write_text(to_json(seal(said)))
+    found = check_entry(path, at_hand)
+    assert found.status == UNVERIFIED
+    assert "scored by evaluator 0.9" in found.reason
+
+
+def test_the_same_predictions_under_two_names_are_refused(board, at_hand):
+    _, said = one_of(board)
+    said["metadata"]["method"] = "Another name"
+    (board / file_name(said)).write_text(to_json(seal(said)))
+    wrong = [each for each in check_entries(board, at_hand) if each.status == WRONG]
+    assert len(wrong) == 2
+    for each in wrong:
+        assert any("these predictions are also those of" in what for _, what in each.problems)
+
+
+def test_a_renamed_file_is_refused(board):
+    path, _ = one_of(board)
+    path.rename(board / "mine.json")
+    found = check_entry(board / "mine.json", AtHand())
+    assert [field for field, _ in found.problems] == ["file name"]
+
+
+@pytest.mark.parametrize("size", range(0, 6000, 731))
+def test_truncated_entries_are_refused(board, size):
+    path, _ = one_of(board)
+    path.write_bytes(path.read_bytes()[:size])
+    assert check_entry(path, AtHand()).problems[0][0] == "the file"
+
+
+@pytest.mark.parametrize(
+    "value", [None, 3, [], "x", {}, [[1]], True, 1e308, -1, {"Chair": {"iou": "x"}}]
+)
+def test_values_of_another_kind_never_break_the_check(board, value):
+    path, said = one_of(board)
+    for part in ("result", "track", "metadata", "digests", "taxonomy", "seals", "kind"):
+        path.write_text(json.dumps(said | {part: value}))
+        assert check_entry(path, AtHand()).status == WRONG
+    for part in said["result"]:
+        path.write_text(json.dumps(said | {"result": said["result"] | {part: value}}))
+        assert check_entry(path, AtHand()).status == WRONG
+
+
+def test_conditions_are_compared_with_their_bands(board):
+    path, said = one_of(board)
+    names = said["taxonomy"]["names"]
+    band = {"iou": dict.fromkeys(names, 0.5), "ca": dict.fromkeys(names, 0.25)}
+    band |= {"mIoU": 0.5, "mCA": 0.25, "points": said["result"]["points"]}
+    said["result"]["conditions"] = {"range_m": {"0-1": band}}
+    path.write_text(to_json(seal(said)))
+    assert check_entry(path, AtHand()).problems == ()
+    band["mIoU"] = 0.6
+    path.write_text(to_json(seal(said)))
+    fields = [field for field, _ in check_entry(path, AtHand()).problems]
+    assert fields == ["result.conditions.range_m.0-1.mIoU"]
+
+
+def test_a_folder_without_entries_is_no_board(tmp_path):
+    with pytest.raises(InvalidInputError, match="expected a folder of entries"):
+        check_entries(tmp_path / "none", AtHand())
+
+
+def test_predictions_that_were_changed_are_named(board, dataset_folder, tmp_path):
+    """A file of that method and track is there, and its digest is another."""
+    shutil.rmtree(board)
+    board.mkdir()
+    folder = tmp_path / "predictions"
+    folder.mkdir()
+    path = write_predictions(folder / "mine.h5", dataset_folder, method="Mine", seed=7)
+    add(path, dataset_folder, board)
+    write_predictions(path, dataset_folder, method="Mine", seed=8)
+    (found,) = check_entries(board, AtHand([str(dataset_folder)], folder))
+    assert found.problems[0][0] == "digests.predictions"
+    assert "mine.h5 is of this method, and its SHA-256 is another" in found.problems[0][1]
