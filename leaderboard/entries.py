@@ -24,6 +24,7 @@ from semantic2d_dataset.format.container import check_version, load_json
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 from semantic2d_dataset.scoring.metrics import Evaluator
+from semantic2d_dataset.scoring.predictions import metadata_problems
 
 FORMAT = "semantic2d-leaderboard-entry"
 FORMAT_VERSION = "1.0"
@@ -165,6 +166,10 @@ def schema_problems(said: Any) -> list[tuple[str, str]]:
         for error in validator.iter_errors(said)
     ]
     if not found and said["kind"] != PUBLISHED:
+        found += [
+            (where, _cut(what))
+            for where, _, what in (p.partition(": ") for p in metadata_problems(said["metadata"]))
+        ]
         try:
             Evaluator(taxonomy_of(said))
         except InvalidInputError as err:

@@ -48,7 +48,6 @@ def _entry_of(row: PublishedRow) -> dict[str, Any]:
     table = published_segmentation()
     metadata: dict[str, Any] = {
         "method": row.method,
-        "paper": table.paper,
         "scans_per_second": row.frames_per_second,
         "scans_per_second_measured": table.processor,
     }
