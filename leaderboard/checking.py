@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from tqdm import tqdm
 from leaderboard.entries import (
     PUBLISHED,
     Entry,
+    file_digest,
     file_name,
     list_entries,
     name_of,
@@ -106,7 +106,7 @@ class AtHand:
         if self._files is None:
             found = sorted(self.predictions.rglob("*.h5")) if self.predictions else []
             bar = tqdm(found, desc="hashing predictions", unit="file", disable=None, leave=False)
-            self._files = {_sha256(path): path for path in bar}
+            self._files = {file_digest(path): path for path in bar}
         return self._files
 
 
@@ -287,8 +287,3 @@ def _is_of(path: Path, said: Mapping[str, Any]) -> bool:
         return same and name_of(metadata) == name_of(said["metadata"])
     except (Semantic2DError, OSError, KeyError, TypeError):
         return False
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -221,6 +221,12 @@ def list_entries(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.json"))
 
 
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, hex."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def to_json(said: Mapping[str, Any]) -> str:
     """Return an entry as JSON text, rows of numbers on one line each."""
     text = json.dumps(said, indent=1, allow_nan=False, ensure_ascii=False)
