@@ -83,10 +83,13 @@ def check(
     entries: _Entries = _ENTRIES,
     data: _Data = None,
     predictions: _Predictions = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Fail also where an entry is unverified.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Check every entry: digests, figures, and the score again where predictions are at hand."""
-    from leaderboard.checking import WRONG, AtHand, check_entries, format_check
+    from leaderboard.checking import UNVERIFIED, WRONG, AtHand, check_entries, format_check
 
     found = check_entries(entries, AtHand(data or (), _folder(predictions)))
     if as_json:
@@ -102,8 +105,31 @@ def check(
         typer.echo(json.dumps(said, indent=1))
     else:
         typer.echo(format_check(found) or f"{entries}: no entries")
-    if any(each.status == WRONG for each in found):
+    failing = {WRONG, UNVERIFIED} if strict else {WRONG}
+    if any(each.status in failing for each in found):
         raise typer.Exit(1)
+
+
+@app.command()
+def fetch(
+    to: Annotated[Path, typer.Option("--to", help="Folder for the predictions files.")],
+    *,
+    entries: _Entries = _ENTRIES,
+    most_mb: Annotated[int, typer.Option(min=1, help="Largest file to get, MB.")] = 500,
+    host: Annotated[
+        list[str] | None, typer.Option(help="The only host to ask; may be repeated.")
+    ] = None,
+) -> None:
+    """Get the predictions that entries point to; each must have the digest that was scored."""
+    from leaderboard.entries import list_entries, read_entry
+    from leaderboard.fetching import fetch_predictions
+
+    to.mkdir(parents=True, exist_ok=True)
+    for path in list_entries(entries):
+        file = fetch_predictions(
+            read_entry(path), to, most_bytes=most_mb * 1_000_000, hosts=host or ()
+        )
+        typer.echo(f"{path.name}: {file or 'points to no predictions'}")
 
 
 @app.command()

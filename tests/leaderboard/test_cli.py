@@ -46,3 +46,76 @@ def test_listing_the_command_imports_nothing_heavy():
     code = "import sys, leaderboard.cli; print({'numba', 'jsonschema', 'h5py'} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "set()\n"
+
+
+def run(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_the_way_from_predictions_to_pages(tmp_path, dataset_folder, predictions_folder):
+    entries, site = tmp_path / "entries", tmp_path / "site"
+    entries.mkdir()
+    fair = predictions_folder / "fair.h5"
+    options = ("--entries", entries)
+    added = run("add", fair, "--data", dataset_folder, *options)
+    assert added.exit_code == 0, added.exception
+    assert "mIoU" in added.stdout
+    assert run("published", *options).stdout.startswith("wrote 17 entries")
+    at_hand = ("--data", dataset_folder, "--predictions", predictions_folder)
+    checked = run("check", *options, *at_hand)
+    assert checked.exit_code == 0
+    assert "fair.json: verified" in checked.stdout
+    assert run("build", site, *options, *at_hand).exit_code == 0
+    assert (site / "index.html").is_file()
+
+
+def test_check_fails_on_wrong_entries_and_on_unverified_ones_where_asked(board):
+    assert run("check", "--entries", board).exit_code == 0
+    assert run("check", "--entries", board, "--strict").exit_code == 1
+    path = sorted(board.iterdir())[0]
+    path.write_text(path.read_text().replace('"points": ', '"points": 1'))
+    found = run("check", "--entries", board, "--json")
+    assert found.exit_code == 1
+    fields = [problem["field"] for problem in json.loads(found.stdout)[0]["problems"]]
+    assert "result.points" in fields
+
+
+def test_sanity_predictions_can_be_added(tmp_path, dataset_folder):
+    (tmp_path / "entries").mkdir()
+    out = tmp_path / "majority.h5"
+    words = ("--data", dataset_folder, "--lidar", "small")
+    assert run("sanity", "majority", "--out", out, *words).exit_code == 0
+    options = ("--data", dataset_folder, "--entries", tmp_path / "entries", "--sanity")
+    assert run("add", out, *options).exit_code == 0
+    with pytest.raises(InvalidInputError, match="exists already"):
+        raise run("sanity", "majority", "--out", out, *words).exception
+
+
+def test_a_private_test_set_from_data_to_ledger(tmp_path, dataset_folder, predictions_folder):
+    public, hidden, ledger = (tmp_path / name for name in ("public", "hidden", "ledger.json"))
+    made = run("private", "make", dataset_folder, public, hidden)
+    assert made.exit_code == 0, made.exception
+    options = ("--labels", hidden, "--ledger", ledger, "--submitter", "ann")
+    assert "(new)" in run("private", "score", predictions_folder / "fair.h5", *options).stdout
+    again = run("private", "score", predictions_folder / "poor.h5", *options)
+    assert "as before: not better by 1.00" in again.stdout
+    shown = run("private", "ledger", ledger)
+    assert "2 lines, none was changed" in shown.stdout
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("add", "none.h5"),
+        ("check", "--entries", "none"),
+        ("build", "site", "--entries", "none"),
+        ("published", "--entries", "none"),
+        ("check", "--predictions", "none"),
+        ("private", "ledger", "none.json"),
+    ],
+)
+def test_what_is_not_there_is_an_error_and_no_traceback(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = run(*words)
+    assert isinstance(found.exception, InvalidInputError | FileNotFoundError)
+    assert not list(tmp_path.iterdir())

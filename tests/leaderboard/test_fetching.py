@@ -1,0 +1,57 @@
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from leaderboard.entries import Entry
+from leaderboard.fetching import fetch_predictions
+from semantic2d_dataset.errors import ChecksumError, DownloadError, InvalidInputError
+from tests.access.hosts import Host, make_bytes
+
+BODY = make_bytes(100_000)
+
+
+@pytest.fixture
+def host():
+    found = Host({"p.h5": BODY})
+    yield found
+    found.close()
+
+
+def entry_of(host, digest):
+    url = f"{host.url}/records/7/files/p.h5"
+    return Entry(Path("x.json"), {"predictions_url": url, "digests": {"predictions": digest}})
+
+
+def test_predictions_are_got_once_and_named_by_their_digest(host, tmp_path):
+    digest = hashlib.sha256(BODY).hexdigest()
+    for _ in range(2):
+        path = fetch_predictions(entry_of(host, digest), tmp_path, most_bytes=len(BODY))
+        assert path == tmp_path / f"{digest}.h5"
+        assert path.read_bytes() == BODY
+    assert len(host.requests) == 1
+
+
+def test_another_file_than_was_scored_is_refused(host, tmp_path):
+    with pytest.raises(ChecksumError, match=r"digests\.predictions: expected 0000"):
+        fetch_predictions(entry_of(host, "0" * 64), tmp_path, most_bytes=len(BODY))
+    assert not list(tmp_path.iterdir())
+
+
+def test_more_bytes_than_allowed_are_not_read(host, tmp_path):
+    with pytest.raises(DownloadError, match="larger than the 5000 bytes"):
+        fetch_predictions(entry_of(host, "0" * 64), tmp_path, most_bytes=5000)
+    assert not list(tmp_path.iterdir())
+
+
+def test_only_the_hosts_that_are_allowed_are_asked(host, tmp_path):
+    with pytest.raises(InvalidInputError, match=r"127\.0\.0\.1 is none of zenodo\.org"):
+        fetch_predictions(
+            entry_of(host, "0" * 64), tmp_path, most_bytes=5000, hosts=("zenodo.org",)
+        )
+    assert host.requests == []
+
+
+def test_an_entry_that_points_nowhere_gets_nothing(tmp_path):
+    entry = Entry(Path("x.json"), {"digests": {"predictions": "0" * 64}})
+    assert fetch_predictions(entry, tmp_path, most_bytes=1) is None
