@@ -1,0 +1,60 @@
+"""Make the board on semantic2d-mini: sanity rows, detectors, and every trained model of a folder.
+
+Run with ``python benchmarks/leaderboard_mini.py --runs RUNS --out FOLDER``. RUNS holds folders that
+training left, named ``<model>-<features>-<lidar>-seed<n>`` as ``semantic2d baseline reproduce``
+names them; of each, seed 0 is shown. FOLDER gets ``predictions/`` and ``site/``; entries go to
+``--entries``. What is there already is kept, so that it can be run again; delete it after a change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+DETECTORS = ("lines", "legs")
+SANITY = ("majority", "perfect")
+
+
+def semantic2d(*words: object) -> None:
+    command = [sys.executable, "-m", "semantic2d_dataset.cli", *map(str, words)]
+    subprocess.run(command, check=True, env={"OMP_NUM_THREADS": "1"} | os.environ)
+
+
+def predict(runs: Path, folder: Path, scheme: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    models = sorted(run for run in runs.glob("*-seed0") if (run / "model.json").exists())
+    for kind in SANITY:
+        if not (folder / f"{kind}.h5").exists():
+            out = folder / f"{kind}.h5"
+            semantic2d("leaderboard", "sanity", kind, "--out", out, "--scheme", scheme)
+    for run in (*DETECTORS, *models):
+        out = folder / f"{Path(run).name}.h5"
+        if not out.exists():
+            more = () if run in DETECTORS else ("--probabilities",)
+            semantic2d("baseline", "predict", run, "--out", out, "--scheme", scheme, *more)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--entries", type=Path, default=Path("leaderboard/entries"))
+    parser.add_argument("--scheme", default="block")
+    said = parser.parse_args()
+    predictions = said.out / "predictions"
+    predict(said.runs, predictions, said.scheme)
+    said.entries.mkdir(parents=True, exist_ok=True)
+    semantic2d("leaderboard", "published", "--entries", said.entries)
+    for path in sorted(predictions.glob("*.h5")):
+        more = ("--sanity",) if path.stem in SANITY else ()
+        semantic2d("leaderboard", "add", path, "--entries", said.entries, "--force", *more)
+    at_hand = ("--entries", said.entries, "--predictions", predictions)
+    semantic2d("leaderboard", "check", "--strict", *at_hand)
+    semantic2d("leaderboard", "build", said.out / "site", *at_hand)
+
+
+if __name__ == "__main__":
+    main()
