@@ -14,7 +14,7 @@ $(SETUP): pyproject.toml constraints.txt
 	  { echo "expected Python 3.11 or later; say which: make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-	  --constraint constraints.txt --editable '.[all,dev]'
+	  --constraint constraints.txt --editable '.[all,browser,dev]'
 	touch $(SETUP)
 
 # Make semantic2d-mini, train S3-Net for two minutes, predict, score, and show it all.
