@@ -132,11 +132,16 @@ class DatasetDiff:
 def diff_datasets(old: OpenDataset, new: OpenDataset) -> DatasetDiff:
     """Compare two versions of a data set; sequences of one content digest are not read.
 
+    As the manifests are taken at their word then, files must be there with the sizes they tell.
+
     Raises
     ------
     DatasetNotFoundError, CorruptFileError, ChecksumError
-        If a file that must be read is missing, damaged or changed.
+        If a file is missing, or one that must be read is damaged, or one was changed.
     """
+    for data in (old, new):
+        for entry in data.manifest.sequences:
+            data.path_of(entry)
     schemes = [{name: data.scheme(name) for name in data.manifest.splits} for data in (old, new)]
     differences = compare(old.manifest, new.manifest, *schemes)
     digests = [

@@ -6,6 +6,7 @@ import pytest
 
 from semantic2d_dataset import cli
 from semantic2d_dataset.access.registry import open_dataset
+from semantic2d_dataset.errors import ChecksumError, DatasetNotFoundError
 from semantic2d_dataset.format.manifest import publish, read_manifest
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
 from semantic2d_dataset.format.split_schemes import make_frame_scheme, schemes_of
@@ -52,10 +53,21 @@ def diff(pair):
 
 def test_equal_data_sets_need_no_version_and_no_sequence_is_read(pair):
     for path in (pair[0] / "sequences").glob("*.h5"):
-        path.unlink()
+        path.write_bytes(bytes(path.stat().st_size))
     found = diff(pair)
     assert (found.differences, found.sequences, found.version) == ((), (), "1.2.3")
     assert str(found).endswith("nothing differs: no new version is needed")
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_files_that_are_not_those_of_the_manifest_are_never_said_to_be_equal(which, pair):
+    path = pair[which] / "sequences" / f"{LOBBY}.h5"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ChecksumError, match=r"found 100; .* publish the data set again"):
+        diff(pair)
+    path.unlink()
+    with pytest.raises(DatasetNotFoundError, match="lobby.*missing.* publish the data set again"):
+        diff(pair)
 
 
 def test_relabelled_beams_are_counted_by_old_and_new_class(pair):
