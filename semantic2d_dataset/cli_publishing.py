@@ -78,12 +78,17 @@ def card(
 ) -> None:
     """Print the card of a data set, counted from its scans as they are."""
     from semantic2d_dataset.access.registry import open_dataset
-    from semantic2d_dataset.format.writing import write_text_atomically
-    from semantic2d_dataset.publishing.about import read_about
+    from semantic2d_dataset.format.checksums import CHECKSUMS_NAME
+    from semantic2d_dataset.format.manifest import MANIFEST_NAME
+    from semantic2d_dataset.format.writing import check_target, write_text_atomically
+    from semantic2d_dataset.publishing.about import ABOUT_NAME, read_about
     from semantic2d_dataset.publishing.card import make_card
     from semantic2d_dataset.publishing.facts import gather_facts
 
     data = open_dataset(dataset)
+    if out is not None:
+        names = (MANIFEST_NAME, CHECKSUMS_NAME, ABOUT_NAME, *(f.file for f in data.manifest.files))
+        check_target(out, [data.root / name for name in names], force=True)
     about = read_about(data.root, data.manifest.name)
     text = make_card(gather_facts(data), about)
     if out is None:

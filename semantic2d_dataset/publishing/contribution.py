@@ -87,7 +87,7 @@ def check_contribution(places: Sequence[Path], against: OpenDataset | None = Non
                 Finding(
                     ERROR,
                     str(file),
-                    str(err),
+                    str(err).removeprefix(f"{file}: "),  # the finding says it already
                     "a whole file of the format",
                     "write it with semantic2d convert or SequenceWriter",
                 )
@@ -103,9 +103,16 @@ def check_contribution(places: Sequence[Path], against: OpenDataset | None = Non
 def _find(places: Sequence[Path]) -> list[Path]:
     files: list[Path] = []
     for place in places:
+        if not place.exists():
+            raise DatasetNotFoundError(
+                f"{place}: does not exist; expected a sequence (*.h5) or a folder of them"
+            )
         inside = [*place.glob("*.h5"), *place.glob("sequences/*.h5")] if place.is_dir() else [place]
-        if not inside or not place.exists():
-            raise DatasetNotFoundError(f"{place}: no sequences (*.h5) here")
+        if not inside:
+            raise DatasetNotFoundError(
+                f"{place}: no sequences (*.h5) here, nor in {place / 'sequences'}; "
+                "make them with semantic2d convert"
+            )
         files += sorted(inside)
     return [*dict.fromkeys(files)]
 

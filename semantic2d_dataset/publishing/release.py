@@ -172,6 +172,11 @@ def release(
 
 
 def _read_sources(folder: Path, *, allow_unlabelled: bool) -> _Sources:
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        raise DatasetNotFoundError(
+            f"{folder}: expected a folder with {SEQUENCES}/*.h5, found {found}"
+        )
     paths = sorted((folder / SEQUENCES).glob("*.h5"))
     if not paths:
         raise DatasetNotFoundError(

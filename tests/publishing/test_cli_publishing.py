@@ -52,4 +52,16 @@ def test_a_contribution_with_an_error_exits_1(run, tmp_path):
     assert json.loads(out)["errors"] > 0
     status, _, err = run("contribute", "check", tmp_path / "nothing")
     assert status == 1
-    assert "no sequences" in err
+    assert "does not exist" in err
+
+
+@pytest.mark.parametrize("file", ["dataset.json", "SHA256SUMS", "DATASET_CARD.md", "release.yaml"])
+def test_a_card_never_takes_the_place_of_what_it_is_about(file, run, tmp_path):
+    rooms = make_rooms(tmp_path / "rooms")
+    (rooms / "release.yaml").write_text("title: Rooms\n")
+    run("release", rooms, "--version", "1.0.0", "--name", "rooms")
+    before = (rooms / file).read_bytes()
+    status, _, err = run("card", rooms, "--out", rooms / file)
+    assert status == 1
+    assert "choose another name" in err
+    assert (rooms / file).read_bytes() == before

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semantic2d_dataset.errors import DatasetNotFoundError
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
 from semantic2d_dataset.publishing.contribution import check_contribution
 from semantic2d_dataset.publishing.findings import ERROR, NOTE, WARNING
@@ -161,6 +162,19 @@ def test_damaged_files_and_missing_labels_are_findings_like_others(tmp_path):
     found = check_contribution([tmp_path])
     assert levels(found, "semantic2d salsa label") == [ERROR]
     assert levels(found, "broken.h5") == [ERROR]
+
+
+def test_a_finding_names_a_damaged_file_once(tmp_path):
+    path = tmp_path / "empty.h5"
+    path.touch()
+    assert str(check_contribution([path])).count(str(path)) == 1
+
+
+def test_what_is_not_there_is_told_from_a_folder_without_sequences(tmp_path):
+    with pytest.raises(DatasetNotFoundError, match="nowhere: does not exist"):
+        check_contribution([tmp_path / "nowhere"])
+    with pytest.raises(DatasetNotFoundError, match="no sequences .* semantic2d convert"):
+        check_contribution([tmp_path])
 
 
 def test_findings_are_the_same_in_words_and_in_json(office):

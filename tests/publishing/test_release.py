@@ -289,6 +289,13 @@ def test_a_folder_without_sequences_cannot_be_released(tmp_path):
         release(tmp_path, version="1.0.0", name="rooms")
 
 
+def test_what_is_no_folder_cannot_be_released_and_is_said_to_be_none(tmp_path):
+    (tmp_path / "scans.h5").touch()
+    for name, found in (("scans.h5", "a file"), ("nowhere", "nothing")):
+        with pytest.raises(DatasetNotFoundError, match=f"{name}: expected a folder .* {found}$"):
+            release(tmp_path / name, version="1.0.0", name="rooms")
+
+
 def test_a_damaged_sequence_leaves_the_old_release(released):
     before = files_of(released / "splits")
     path = released / "sequences" / "lobby--first--small.h5"
