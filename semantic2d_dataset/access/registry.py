@@ -17,11 +17,10 @@ from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
 from semantic2d_dataset.format.locks import alone
 from semantic2d_dataset.format.manifest import (
     MANIFEST_NAME,
-    FileEntry,
     Manifest,
     SequenceEntry,
     check_sequence,
-    check_size,
+    find_file,
     read_manifest,
 )
 from semantic2d_dataset.format.sequence import SequenceReader
@@ -66,25 +65,6 @@ class OpenDataset:
             )
         return found
 
-    def path_of(self, entry: FileEntry) -> Path:
-        """Return where a file of the manifest lies.
-
-        Raises
-        ------
-        DatasetNotFoundError
-            If it is missing.
-        ChecksumError
-            If it has another size than the manifest tells.
-        """
-        path = self.root / entry.file
-        if not path.is_file():
-            raise DatasetNotFoundError(
-                f"{path}: missing, though {MANIFEST_NAME} names it: get it again, or publish the "
-                "data set again"
-            )
-        check_size(path, entry)
-        return path
-
     def scheme(self, name: str) -> SplitScheme:
         """Read a split scheme.
 
@@ -101,7 +81,7 @@ class OpenDataset:
                 f"{self.manifest.name}: unknown scheme {name!r}; "
                 f"known are {', '.join(sorted(self.manifest.splits))}"
             )
-        return read_scheme(self.path_of(entry), name, self.manifest.lengths)
+        return read_scheme(find_file(self.root, entry), name, self.manifest.lengths)
 
     def lidars_of(self, scheme: str, split: str) -> list[str]:
         """Return the names of the lidars that have scans in a split.
@@ -128,7 +108,7 @@ class OpenDataset:
         entry = next((e for e in self.manifest.sequences if e.id == sequence_id), None)
         if entry is None:
             raise DatasetNotFoundError(f"{self.manifest.name}: has no sequence {sequence_id!r}")
-        reader = SequenceReader(self.path_of(entry))
+        reader = SequenceReader(find_file(self.root, entry))
         check_sequence(reader, entry)
         return reader
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
-from semantic2d_dataset.format.manifest import Manifest, check_sequence, check_size
+from semantic2d_dataset.format.manifest import Manifest, check_sequence, find_file
 from semantic2d_dataset.format.sequence import SequenceReader
 from semantic2d_dataset.format.splits import NONE, TRAIN, SplitScheme, is_next_to, split_id
 
@@ -157,16 +157,16 @@ def read_tracks(folder: Path, manifest: Manifest) -> Iterator[Track]:
 
     Raises
     ------
+    DatasetNotFoundError
+        If a file is missing.
     ChecksumError
-        If a file was changed since the manifest was written.
+        If it was changed since the manifest was written.
     CorruptFileError, UnsafeFileError, FormatVersionError
         If it cannot be read.
     """
     entries = sorted(manifest.sequences, key=lambda entry: entry.id)
     for entry in tqdm(entries, desc="auditing", unit="file", disable=None, leave=False):
-        path = Path(folder) / entry.file
-        check_size(path, entry)
-        with SequenceReader(path) as reader:
+        with SequenceReader(find_file(folder, entry)) as reader:
             check_sequence(reader, entry)
             yield Track(entry.id, reader.read("scans/stamps_ns"), reader.read_poses())
 

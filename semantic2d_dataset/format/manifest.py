@@ -332,10 +332,7 @@ def check_files(folder: Path, manifest: Manifest, *, full: bool) -> dict[str, Se
 
 
 def _verify(folder: Path, manifest: Manifest, entry: FileEntry, *, full: bool) -> None:
-    path = folder / entry.file
-    if not path.is_file():
-        raise DatasetNotFoundError(f"{path}: missing")
-    check_size(path, entry)
+    path = find_file(folder, entry)
     if full and size_and_digest(path)[1] != entry.sha256:
         raise ChecksumError(f"{path}: its SHA-256 is not the one in {MANIFEST_NAME}")
     if not isinstance(entry, SequenceEntry):
@@ -350,20 +347,27 @@ def _verify(folder: Path, manifest: Manifest, entry: FileEntry, *, full: bool) -
             raise ChecksumError(f"{path}: its content digest is not the one in {MANIFEST_NAME}")
 
 
-def check_size(path: Path, entry: FileEntry) -> None:
-    """Check that a file has the size that its manifest tells.
+def find_file(folder: Path, entry: FileEntry) -> Path:
+    """Return where a file of a manifest lies.
 
     Raises
     ------
+    DatasetNotFoundError
+        If it is missing.
     ChecksumError
-        If it was changed since.
+        If it has another size than the manifest tells.
     """
+    path = Path(folder) / entry.file
+    remedy = "get it again, or publish the data set again"
+    if not path.is_file():
+        raise DatasetNotFoundError(f"{path}: missing, though {MANIFEST_NAME} names it: {remedy}")
     found = path.stat().st_size
     if found != entry.bytes:
         raise ChecksumError(
             f"{path}: expected {entry.bytes} bytes, found {found}; it was changed since "
-            f"{MANIFEST_NAME} was written: get it again, or publish the data set again"
+            f"{MANIFEST_NAME} was written: {remedy}"
         )
+    return path
 
 
 def check_sequence(reader: SequenceReader, entry: SequenceEntry) -> None:

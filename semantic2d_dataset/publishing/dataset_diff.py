@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from semantic2d_dataset.access.registry import OpenDataset
+from semantic2d_dataset.format.manifest import find_file
 from semantic2d_dataset.format.splits import NONE, TEST, TRAIN, VAL
 from semantic2d_dataset.publishing.sequence_diff import (
     SequenceDiff,
@@ -141,7 +142,7 @@ def diff_datasets(old: OpenDataset, new: OpenDataset) -> DatasetDiff:
     """
     for data in (old, new):
         for entry in data.manifest.sequences:
-            data.path_of(entry)
+            find_file(data.root, entry)
     schemes = [{name: data.scheme(name) for name in data.manifest.splits} for data in (old, new)]
     differences = compare(old.manifest, new.manifest, *schemes)
     digests = [

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semantic2d_dataset.errors import ChecksumError
+from semantic2d_dataset.errors import ChecksumError, DatasetNotFoundError
 from semantic2d_dataset.format.leakage import Track, audit_schemes, read_tracks
 from semantic2d_dataset.format.leakage_report import describe_audit, format_audit, percent, verdict
 from semantic2d_dataset.format.manifest import read_manifest
@@ -217,3 +217,8 @@ def test_changed_sequence_is_not_audited(dataset_folder, tmp_path):
         (tmp_path / entry.file).write_bytes(b"x")
     with pytest.raises(ChecksumError, match="expected .* bytes, found 1"):
         [*read_tracks(tmp_path, manifest)]
+
+
+def test_missing_sequence_is_named_with_what_to_do(dataset_folder, tmp_path):
+    with pytest.raises(DatasetNotFoundError, match="missing, though dataset.json .* get it again"):
+        [*read_tracks(tmp_path, read_manifest(dataset_folder))]
