@@ -158,7 +158,7 @@ def release(
             _check_labels(facts)
         made = _document(folder, staged, made, facts, about)
         differences = _check_version(folder, before, made, schemes, documented=True)
-        notices = _notices(made, sources, about, schemes)
+        notices = _notices(made, sources, about, schemes, here if before is None else None)
         if _is_there(folder, here, made):
             return Release(read_manifest(folder), False, (), notices)  # noqa: FBT003
         swap(
@@ -372,9 +372,20 @@ def _is_there(folder: Path, here: Manifest | None, made: Manifest) -> bool:
 
 
 def _notices(
-    made: Manifest, sources: _Sources, about: About, schemes: Sequence[SplitScheme]
+    made: Manifest,
+    sources: _Sources,
+    about: About,
+    schemes: Sequence[SplitScheme],
+    unreleased: Manifest | None,
 ) -> tuple[str, ...]:
+    """Say what should be looked at; `unreleased` was in the folder, and set no version to keep."""
     found = []
+    gone = [] if unreleased is None else sorted({*unreleased.lengths} - {*made.lengths})
+    if gone:
+        found.append(
+            f"{len(gone)} sequence(s) that {MANIFEST_NAME} named are not in {SEQUENCES}/ any more "
+            f"and are left out (first: {gone[0]})"
+        )
     if made.license == UNKNOWN:
         found.append("the licence is unknown: nobody may use the data then; say it with --license")
     others = {

@@ -289,6 +289,14 @@ def test_a_folder_without_sequences_cannot_be_released(tmp_path):
         release(tmp_path, version="1.0.0", name="rooms")
 
 
+def test_a_sequence_that_was_lost_since_it_was_published_is_said_to_be_left_out(rooms):
+    publish(rooms, name="rooms", version="1.0.0")
+    lost = sorted((rooms / "sequences").glob("*.h5"))[0]
+    lost.unlink()
+    made = release(rooms, version="1.0.0")
+    assert any(f"are left out (first: {lost.stem})" in each for each in made.notices)
+
+
 def test_what_is_no_folder_cannot_be_released_and_is_said_to_be_none(tmp_path):
     (tmp_path / "scans.h5").touch()
     for name, found in (("scans.h5", "a file"), ("nowhere", "nothing")):
