@@ -60,8 +60,7 @@ def add(
     from semantic2d_dataset.scoring.metrics import percent
     from semantic2d_dataset.scoring.predictions import PredictionsReader
 
-    if not entries.is_dir():
-        raise InvalidInputError(f"{entries}: no such folder; make it, or say another --entries")
+    _check_entries(entries)
     with PredictionsReader(predictions) as reader:
         name = data or reader.dataset
     if not name:
@@ -154,8 +153,7 @@ def published(*, entries: _Entries = _ENTRIES) -> None:
     from leaderboard.adding import add_entry
     from leaderboard.published import published_entries
 
-    if not entries.is_dir():
-        raise InvalidInputError(f"{entries}: no such folder; make it, or say another --entries")
+    _check_entries(entries)
     paths = [add_entry(entry, entries, force=True) for entry in published_entries()]
     typer.echo(f"wrote {len(paths)} entries into {entries}")
 
@@ -197,6 +195,11 @@ def table(
         raise typer.BadParameter("choose one of --markdown and --json")
     layout = to_markdown if markdown else to_json if as_json else to_text
     typer.echo(layout(rank(results)))
+
+
+def _check_entries(entries: Path) -> None:
+    if not entries.is_dir():
+        raise InvalidInputError(f"{entries}: no such folder; make it, or say another --entries")
 
 
 def _folder(predictions: Path | None) -> Path | None:
