@@ -17,6 +17,7 @@ from leaderboard.checking import (
 from leaderboard.entries import file_name, seal, to_json
 from leaderboard.published import published_entries
 from semantic2d_dataset.errors import InvalidInputError
+from tests.conftest import PROJECT
 from tests.leaderboard.boards import add, edited, json_path, leaves_of, write_predictions
 
 
@@ -41,6 +42,13 @@ def test_entries_whose_predictions_or_data_are_not_at_hand_are_unverified(board,
     assert {each.status for each in without} == {UNVERIFIED}
     assert "its predictions are not at hand" in format_check(without)
     assert "generated 1.0.0 is not at hand" in format_check(check_entries(board, AtHand()))
+
+
+def test_no_entry_that_comes_with_the_project_is_wrong(mini):
+    found = check_entries(PROJECT / "leaderboard" / "entries", AtHand())
+    assert {each.status for each in found} == {UNVERIFIED, AS_PUBLISHED}, format_check(found)
+    reasons = {each.reason for each in found if each.status == UNVERIFIED}
+    assert reasons == {"its predictions are not at hand"}  # data set and evaluator are the entries'
 
 
 def test_the_published_rows_are_as_published(tmp_path):
