@@ -27,6 +27,8 @@ from semantic2d_dataset.cli_submission import (
     report,
     robustness,
     score,
+    score_merge,
+    score_part,
     submission,
 )
 from semantic2d_dataset.cli_table import table
@@ -200,6 +202,8 @@ def simulate(
 
 
 app.command()(score)
+app.command()(score_part)
+app.command()(score_merge)
 app.command()(report)
 app.command()(compare)
 app.command()(corrupt)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,7 +47,6 @@ def score(
     Several files are seeds of one method: each is scored, and mean and deviation are printed.
     """
     from semantic2d_dataset.executors import open_executor
-    from semantic2d_dataset.format.writing import write_text_atomically
     from semantic2d_dataset.scoring import spreads
     from semantic2d_dataset.scoring import submission as scoring
 
@@ -65,19 +66,56 @@ def score(
     said: dict[str, Any] = results[0]
     if len(results) > 1:
         said = {"spread": spreads.spread_of_seeds(results), "results": results}
-    text = scoring.result_to_json(said)
-    if out is not None:
-        write_text_atomically(out, text)
-    if as_json:
-        typer.echo(text)
-        return
-    for path, result in zip(predictions, results, strict=True):
-        typer.echo(f"{path}\n" if len(results) > 1 else "", nl=False)
-        typer.echo(scoring.format_score(result))
-    if len(results) > 1:
-        count = len(results)
-        typer.echo(f"\nMean and standard deviation over {count} seeds, percent")
-        typer.echo(scoring.format_spread(said["spread"]))
+    _tell(said, zip(predictions, results, strict=True), out, as_json=as_json)
+
+
+def score_part(
+    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    part: Annotated[
+        str, typer.Argument(metavar="K/N", help="Part K of N of the sequences, such as 2/4.")
+    ],
+    out: Annotated[Path, typer.Argument(help="File of counts to write.")],
+    *,
+    data: Data = None,
+    scheme: SchemeName = None,
+    split: SplitName = None,
+    jobs: Jobs = 1,
+) -> None:
+    """Score a part of the sequences, for several machines to share; see score-merge."""
+    from semantic2d_dataset.executors import open_executor
+    from semantic2d_dataset.scoring.counts import write_counts
+    from semantic2d_dataset.scoring.submission import count_predictions
+
+    if not (found := re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", part)):
+        raise typer.BadParameter(f"expected K/N, such as 2/4, found {part!r}")
+    _check_out(out, predictions)
+    with open_executor(jobs=jobs) as executor:
+        counts = count_predictions(
+            predictions,
+            _open_for(predictions, data),
+            scheme=scheme,
+            split=split,
+            part=(int(found[1]), int(found[2])),
+            executor=executor,
+        )
+    write_counts(counts, out)
+    did, of = len(counts.tallies), len(counts.sequences)
+    typer.echo(f"wrote {out}: counts of {did} of {of} sequences")
+
+
+def score_merge(
+    parts: Annotated[list[Path], typer.Argument(help="Files of counts, of all parts.")],
+    *,
+    out: Annotated[Path | None, typer.Option(help="Write the result as JSON.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Put the parts of score-part together: the result that score gives, to the byte."""
+    from semantic2d_dataset.scoring.counts import read_counts
+    from semantic2d_dataset.scoring.submission import score_counts
+
+    _check_out(out, *parts)
+    result = score_counts(map(read_counts, parts))
+    _tell(result, [(parts[0], result)], out, as_json=as_json)
 
 
 def report(
@@ -242,6 +280,33 @@ def show(
 
     said = describe_predictions(path)
     typer.echo(json.dumps(said, indent=1) if as_json else format_summary(said))
+
+
+def _tell(
+    said: Mapping[str, Any],
+    results: Iterable[tuple[Path, Mapping[str, Any]]],
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Write a result, or the spread of several, and print it; each comes with its file."""
+    from semantic2d_dataset.format.writing import write_text_atomically
+    from semantic2d_dataset.scoring import submission as scoring
+
+    text = scoring.result_to_json(said)
+    if out is not None:
+        write_text_atomically(out, text)
+    if as_json:
+        typer.echo(text)
+        return
+    several = "spread" in said
+    for path, result in results:
+        typer.echo(f"{path}\n" if several else "", nl=False)
+        typer.echo(scoring.format_score(result))
+    if several:
+        count = said["spread"]["count"]
+        typer.echo(f"\nMean and standard deviation over {count} seeds, percent")
+        typer.echo(scoring.format_spread(said["spread"]))
 
 
 def _open_for(predictions: Path, data: str | None) -> OpenDataset:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +86,26 @@ class Taxonomy:
         table = np.full((256, 3), 235, np.uint8)
         table[: len(self.names)] = self.colours
         return table
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON, which `from_dict` reads."""
+        return {
+            "names": list(self.names),
+            "colours": [list(colour) for colour in self.colours],
+            "background_id": self.background_id,
+        }
+
+    @classmethod
+    def from_dict(cls, said: Mapping[str, Any]) -> Taxonomy:
+        """Return the classes that `as_dict` wrote.
+
+        Raises
+        ------
+        InvalidInputError
+            If they are none.
+        """
+        colours = tuple((r, g, b) for r, g, b in said["colours"])
+        return cls(tuple(said["names"]), colours, said["background_id"])
 
     def id_of(self, name: str) -> int:
         """Return the id of a class by its name, whatever its case or published spelling.

@@ -64,8 +64,9 @@ class Calibration:
         self.taxonomy = taxonomy
         self.bins = bins
         self.ignored = 0
-        self._confidence: NDArray[np.int64] = np.zeros((bins, 3), np.int64)
-        self._entropy: NDArray[np.int64] = np.zeros((bins * _FINE, 3), np.int64)
+        # points, hits, and the sum of the value in parts of `_UNIT`, by bin
+        self.by_confidence: NDArray[np.int64] = np.zeros((bins, 3), np.int64)
+        self.by_entropy: NDArray[np.int64] = np.zeros((bins * _FINE, 3), np.int64)
 
     def update(
         self,
@@ -98,7 +99,7 @@ class Calibration:
         """
         t, p = np.asarray(truth), np.asarray(probabilities)
         counted = _counted(t, p, valid, len(self.taxonomy))
-        confidence, entropy = np.zeros_like(self._confidence), np.zeros_like(self._entropy)
+        confidence, entropy = np.zeros_like(self.by_confidence), np.zeros_like(self.by_entropy)
         first = _count(
             t[counted].astype(np.int64),
             p[counted].astype(np.float32, copy=False),
@@ -111,8 +112,8 @@ class Calibration:
                 f"probabilities{where}: expected numbers from 0 to 1 that add up to 1, "
                 f"found {p[tuple(where)].tolist()}"
             )
-        self._confidence += confidence
-        self._entropy += entropy
+        self.by_confidence += confidence
+        self.by_entropy += entropy
         self.ignored += t.size - int(counted.sum())
         return self
 
@@ -126,8 +127,8 @@ class Calibration:
         """
         if (other.taxonomy, other.bins) != (self.taxonomy, self.bins):
             raise InvalidInputError("cannot merge calibrations of different taxonomies or bins")
-        self._confidence += other._confidence
-        self._entropy += other._entropy
+        self.by_confidence += other.by_confidence
+        self.by_entropy += other.by_entropy
         self.ignored += other.ignored
         return self
 
@@ -143,9 +144,9 @@ class Calibration:
             ``entropy_bins`` with ``low``, ``high``, ``points``, mean ``entropy`` and ``error``,
             the share of wrong points. A figure of no point is None.
         """
-        points, hits, total = _columns(self._confidence)
+        points, hits, total = _columns(self.by_confidence)
         entropy_points, entropy_hits, entropy_total = _columns(
-            self._entropy.reshape(self.bins, _FINE, 3).sum(axis=1)
+            self.by_entropy.reshape(self.bins, _FINE, 3).sum(axis=1)
         )
         count = int(points.sum())
         gaps = np.abs(total - hits)[points > 0]
@@ -173,7 +174,7 @@ class Calibration:
 
         Within a fine bin, errors are taken to be spread evenly.
         """
-        points, hits, _ = _columns(self._entropy)
+        points, hits, _ = _columns(self.by_entropy)
         kept, wrong = (np.concatenate(((0.0,), np.cumsum(c))) for c in (points, points - hits))
         slopes = np.divide(points - hits, points, out=np.zeros_like(points), where=points > 0)
         # the integral of (wrong + slope * (x - kept)) / x over each bin

@@ -124,7 +124,7 @@ def compare_predictions(
     """
     runner = executor or Serial()
     task, names = _common_task(a, b, dataset)
-    tallies = [count_predictions(path, dataset, executor=runner) for path in (a, b)]
+    tallies = [count_predictions(path, dataset, executor=runner).tallies for path in (a, b)]
     differ = partial(_differ, Path(a), Path(b), dataset)
     found = runner.map(differ, task.scans.items())
     bar = tqdm(found, "comparing", len(task.scans), unit="sequence", disable=None, leave=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from semantic2d_dataset.executors import Executor, Serial
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 from semantic2d_dataset.scoring.calibration import Calibration
 from semantic2d_dataset.scoring.conditions import BANDS, describe_bands, figure_of
+from semantic2d_dataset.scoring.counts import Counts, merge_counts
 from semantic2d_dataset.scoring.intervals import blocks_of, intervals
 from semantic2d_dataset.scoring.metrics import EVALUATOR_VERSION, Evaluator, format_table, percent
 from semantic2d_dataset.scoring.predictions import PredictionsReader, PredictionsWriter
@@ -32,6 +33,7 @@ __all__ = [
     "format_score",
     "format_spread",
     "result_to_json",
+    "score_counts",
     "score_predictions",
     "validate",
 ]
@@ -79,12 +81,26 @@ def score_predictions(
     FileNotFoundError, CorruptFileError, UnsafeFileError, FormatVersionError
         If the file cannot be opened safely, or is damaged.
     """
-    path = Path(path)
-    tallies = count_predictions(path, dataset, scheme=scheme, split=split, executor=executor)
-    with PredictionsReader(path) as predictions:
-        task = task_of(predictions, dataset, scheme, split)
-        submission = _describe(predictions, dataset, task)
-    return _scores_of(tallies, task.taxonomy) | {"submission": submission}
+    return score_counts(
+        [count_predictions(path, dataset, scheme=scheme, split=split, executor=executor)]
+    )
+
+
+def score_counts(parts: Iterable[Counts]) -> dict[str, Any]:
+    """Compute scores from the counts of all parts of a submission.
+
+    Returns
+    -------
+    dict
+        As `score_predictions`: the same, however the parts were shared.
+
+    Raises
+    ------
+    InvalidInputError
+        If the parts are of different submissions, or a sequence comes twice or not at all.
+    """
+    counts = merge_counts(parts)
+    return _scores_of(counts.tallies, counts.taxonomy) | {"submission": dict(counts.submission)}
 
 
 def count_predictions(
@@ -93,21 +109,32 @@ def count_predictions(
     *,
     scheme: str | None = None,
     split: str | None = None,
+    part: tuple[int, int] = (1, 1),
     executor: Executor | None = None,
-) -> tuple[Tally, ...]:
+) -> Counts:
     """Validate predictions, and count them: all that their scores are computed from.
 
-    Parameters and errors are those of `score_predictions`.
+    Parameters and errors are those of `score_predictions`, and
+
+    Parameters
+    ----------
+    part
+        Which part of the sequences to check and count, see `Task.share`: the others are for
+        other machines.
     """
     path, runner = Path(path), executor or Serial()
     with PredictionsReader(path) as predictions:
-        problems = validate(predictions, dataset, scheme=scheme, split=split, executor=runner)
+        problems = validate(
+            predictions, dataset, scheme=scheme, split=split, part=part, executor=runner
+        )
         if problems:
             raise SubmissionError(path, problems)
         task = task_of(predictions, dataset, scheme, split)
-    counted = runner.map(partial(count_sequence, path, dataset), task.scans.items(), in_order=False)
-    bar = tqdm(counted, "scoring", len(task.scans), unit="sequence", disable=None, leave=False)
-    return merge_tallies(bar)
+        submission = _describe(predictions, dataset, task)
+    share = task.share(part)
+    counted = runner.map(partial(count_sequence, path, dataset), share.items(), in_order=False)
+    bar = tqdm(counted, "scoring", len(share), unit="sequence", disable=None, leave=False)
+    return Counts(submission, task.taxonomy, tuple(task.scans), merge_tallies(bar))
 
 
 def format_score(result: Mapping[str, Any]) -> str:

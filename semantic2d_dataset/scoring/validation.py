@@ -50,6 +50,24 @@ class Task:
     lidars: tuple[str, ...]
     taxonomy: Taxonomy
 
+    def share(self, part: tuple[int, int]) -> dict[str, NDArray[np.int64]]:
+        """Return the scans of a part: (1, 4) to (4, 4) share the sequences among four.
+
+        Raises
+        ------
+        InvalidInputError
+            If there is no such part, or there are more parts than sequences.
+        """
+        number, of = part
+        if not 1 <= number <= of:
+            raise InvalidInputError(f"part {number}/{of}: expected 1/{of} to {of}/{of}")
+        if of > len(self.scans):
+            raise InvalidInputError(
+                f"part {number}/{of}: there are {len(self.scans)} sequences to share; "
+                "use no more parts than that"
+            )
+        return dict(list(self.scans.items())[number - 1 :: of])
+
 
 def validate(
     predictions: PredictionsReader | Path,
@@ -57,6 +75,7 @@ def validate(
     *,
     scheme: str | None = None,
     split: str | None = None,
+    part: tuple[int, int] = (1, 1),
     executor: Executor | None = None,
 ) -> list[str]:
     """List every reason why predictions cannot be scored; the scorer asks this function.
@@ -73,6 +92,8 @@ def validate(
         The data set that they are for.
     scheme, split
         What to score, where the file does not say; where it does, they must agree.
+    part
+        Whose arrays to look at, see `Task.share`; the whole file must make sense.
     executor
         Where sequences are checked; this process if not given.
 
@@ -88,7 +109,9 @@ def validate(
     """
     if not isinstance(predictions, PredictionsReader):
         with PredictionsReader(predictions) as reader:
-            return validate(reader, dataset, scheme=scheme, split=split, executor=executor)
+            return validate(
+                reader, dataset, scheme=scheme, split=split, part=part, executor=executor
+            )
     problems = _identity_problems(predictions, dataset.manifest, scheme, split)
     problems += _metadata_of(predictions)
     try:
@@ -104,9 +127,9 @@ def validate(
         problems.append(f"{name}: the split has no scan of this sequence; leave it out")
     problems += _optional_problems(predictions, task)
     check = partial(_sequence_problems, predictions.path, dataset, len(task.taxonomy))
-    found = (executor or Serial()).map(check, task.scans.items())
-    total = len(task.scans)
-    for each in tqdm(found, "validating", total, unit="sequence", disable=None, leave=False):
+    share = task.share(part)
+    found = (executor or Serial()).map(check, share.items())
+    for each in tqdm(found, "validating", len(share), unit="sequence", disable=None, leave=False):
         problems += each
     return _printable(problems)
 

@@ -4,18 +4,15 @@ import pytest
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.executors import Processes
-from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
 from semantic2d_dataset.scoring import tallies
 from semantic2d_dataset.scoring.calibration import Calibration
 from semantic2d_dataset.scoring.metrics import Evaluator
 from semantic2d_dataset.scoring.submission import (
-    PredictionsWriter,
     count_predictions,
     result_to_json,
     score_predictions,
 )
-
-SAMPLES = 3
+from tests.scoring.guesses import SAMPLES, guesses, write_guesses
 
 
 @pytest.fixture(scope="module")
@@ -23,37 +20,9 @@ def data(dataset_folder):
     return open_dataset(dataset_folder)
 
 
-def guesses(data, name):
-    """Labels, probabilities and samples of the test scans of a sequence."""
-    indices = data.scheme("block").scans_of(name, "test")
-    truth = data.reader(name).read("scans/labels")[indices]
-    rng = np.random.default_rng(len(name))
-    labels = np.where(rng.random(truth.shape) < 0.4, rng.integers(0, 10, truth.shape), truth % 10)
-    samples = np.where(rng.random((SAMPLES, *truth.shape)) < 0.2, 9, labels).astype(np.uint8)
-    raw = rng.random((*truth.shape, 10)) + 3 * np.eye(10)[labels]
-    probabilities = (raw / raw.sum(axis=-1, keepdims=True)).astype(np.float16)
-    return indices, labels.astype(np.uint8), probabilities, samples
-
-
 @pytest.fixture(scope="module")
 def predictions(data, tmp_path_factory):
-    path = tmp_path_factory.mktemp("tallies") / "p.h5"
-    with PredictionsWriter(
-        path,
-        dataset=data.manifest.name,
-        dataset_version="1.0.0",
-        scheme="block",
-        split="test",
-        taxonomy=SEMANTIC2D,
-        metadata={"method": "guess"},
-    ) as writer:
-        for entry in data.manifest.sequences:
-            indices, labels, probabilities, samples = guesses(data, entry.id)
-            order = np.random.default_rng(1).permutation(len(indices))
-            writer.add(
-                entry.id, indices[order], labels[order], probabilities[order], samples[:, order]
-            )
-    return path
+    return write_guesses(tmp_path_factory.mktemp("tallies") / "p.h5", data)
 
 
 def test_uncertainty_is_that_of_scans_in_their_order(data, predictions):
@@ -73,7 +42,7 @@ def test_uncertainty_is_that_of_scans_in_their_order(data, predictions):
 
 
 def test_windows_and_conditions_add_up_to_the_confusion(data, predictions):
-    for tally in count_predictions(predictions, data):
+    for tally in count_predictions(predictions, data).tallies:
         total = tally.evaluator.confusion
         assert (sum(tally.windows.values()) == total).all()
         for counts in tally.conditions.values():
@@ -101,11 +70,11 @@ def test_neither_workers_nor_order_change_a_byte_of_the_result(data, predictions
     alone = result_to_json(score_predictions(predictions, data))
     with Processes(4) as executor:
         assert result_to_json(score_predictions(predictions, data, executor=executor)) == alone
-        counted = count_predictions(predictions, data, executor=executor)
+        counted = count_predictions(predictions, data, executor=executor).tallies
     assert tallies.merge_tallies(reversed(counted)) == counted
 
 
 def test_a_sequence_is_counted_once(data, predictions):
-    counted = count_predictions(predictions, data)
+    counted = count_predictions(predictions, data).tallies
     with pytest.raises(InvalidInputError, match="counted twice"):
         tallies.merge_tallies([*counted, counted[0]])
