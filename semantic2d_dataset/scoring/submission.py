@@ -65,8 +65,8 @@ def score_predictions(
     Returns
     -------
     dict
-        As `Evaluator.compute`, and ``per_lidar`` with the same by lidar name; ``conditions``,
-        by condition and band what `conditions.summarise` returns; ``intervals``, see there;
+        As `Evaluator.compute`, with ``intervals``, see there; ``per_lidar`` with the same by
+        lidar name; ``conditions``, by condition and band what `conditions.summarise` returns;
         ``calibration`` where there are probabilities, as `Calibration.compute`; ``samples``
         where there are samples, as `spreads.spread`; and ``submission``: dataset,
         dataset_version, scheme, split, lidars, number of scans, metadata, ``digests`` (SHA-256
@@ -184,20 +184,25 @@ def result_to_json(result: Mapping[str, Any]) -> str:
 
 
 def _scores_of(tallies: Sequence[Tally], taxonomy: Taxonomy) -> dict[str, Any]:
-    total = Evaluator(taxonomy)
-    per_lidar: dict[str, Evaluator] = {}
-    for tally in tallies:
-        total.merge(tally.evaluator)
-        per_lidar.setdefault(tally.lidar, Evaluator(taxonomy)).merge(tally.evaluator)
+    lidars = sorted({tally.lidar for tally in tallies})
     return (
-        total.compute()
+        _scores_with_intervals(tallies, taxonomy)
         | {
-            "per_lidar": {name: per_lidar[name].compute() for name in sorted(per_lidar)},
+            "per_lidar": {
+                lidar: _scores_with_intervals([t for t in tallies if t.lidar == lidar], taxonomy)
+                for lidar in lidars
+            },
             "conditions": _by_environment(tallies, taxonomy) | _by_band(tallies, taxonomy),
-            "intervals": intervals(blocks_of(tallies)),
         }
         | _uncertainty_of(tallies, taxonomy)
     )
+
+
+def _scores_with_intervals(tallies: Sequence[Tally], taxonomy: Taxonomy) -> dict[str, Any]:
+    total = Evaluator(taxonomy)
+    for tally in tallies:
+        total.merge(tally.evaluator)
+    return total.compute() | {"intervals": intervals(blocks_of(tallies))}
 
 
 def _by_environment(tallies: Sequence[Tally], taxonomy: Taxonomy) -> dict[str, Any]:
