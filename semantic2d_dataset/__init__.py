@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         LidarDataset,
         RPLidarS2,
     )
-    from semantic2d_dataset.access.torch_lidars import load_lidars
     from semantic2d_dataset.access.torch_samplers import Shard
     from semantic2d_dataset.errors import Semantic2DError
     from semantic2d_dataset.format.manifest import Manifest, publish, read_manifest
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
         SequenceWriter,
     )
     from semantic2d_dataset.format.splits import SplitScheme
-    from semantic2d_dataset.loading import load_dataset
+    from semantic2d_dataset.loading import load_dataset, load_lidars
     from semantic2d_dataset.scene.geometry import Pose2
     from semantic2d_dataset.scene.lidars import LidarSpec
     from semantic2d_dataset.scene.maps import SemanticMap
@@ -62,7 +61,7 @@ _HOMES = {
     "WLR716": "access.torch_datasets",
     "dask_arrays": "access.dask_arrays",
     "load_dataset": "loading",
-    "load_lidars": "access.torch_lidars",
+    "load_lidars": "loading",
     "open_dataset": "access.registry",
     "publish": "format.manifest",
     "read_manifest": "format.manifest",

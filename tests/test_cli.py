@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from semantic2d_dataset import __version__, cli, load_dataset
+from semantic2d_dataset import __version__, cli, load_dataset, load_lidars
 from semantic2d_dataset.errors import DatasetNotFoundError
 from semantic2d_dataset.format.manifest import read_manifest
 from tests.access import hosts
@@ -438,6 +438,8 @@ def test_downloaded_data_set_is_listed_loaded_repaired_and_removed(archives, run
         load_dataset("d", lidar="wlr716", split=None)
     scans = load_dataset("d", lidar="wlr716", split=None, download=True)
     assert (len(scans), scans.lidar.name) == (6, WLR)
+    both = load_lidars("d", ["hokuyo", "wlr716"], split=None, download=True)
+    assert len(both) == 12
     said = json.loads(run("list", "--json")[1])
     assert [each["folder"] for each in said if "folder" in each] == [str(folder)]
     assert f"in {folder}" in run("show", "d")[1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from semantic2d_dataset.access.angular_grids import AngularGrid, GridSource, common_grid
-from semantic2d_dataset.access.registry import OpenDataset, open_dataset
+from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.access.torch_batches import Batch, BatchedDataset
 from semantic2d_dataset.access.torch_datasets import LidarDataset
 from semantic2d_dataset.errors import InvalidInputError
@@ -153,35 +152,3 @@ class CombinedLidars(BatchedDataset):
             else:
                 batch[key] = torch.cat([each[key] for each in batches])[torch.from_numpy(back)]
         return batch | {"lidar": torch.from_numpy(lidar)}
-
-
-def load_lidars(
-    name: str | Path,
-    lidars: Sequence[str] | None = None,
-    *,
-    split: str | None = "train",
-    **options: Any,
-) -> CombinedLidars:
-    """Load the scans of several lidars of one split of a data set, on one grid of bearings.
-
-    Parameters
-    ----------
-    name
-        ``semantic2d-mini`` (made on first use), or the folder of a data set.
-    lidars
-        Ids or short names; all that it has where not given.
-    split
-        ``train``, ``val`` (or ``dev``), ``test``; None takes every scan.
-    options
-        As for `CombinedLidars`.
-
-    Raises
-    ------
-    DatasetNotFoundError, InvalidInputError, CorruptFileError
-        As from `CombinedLidars`.
-
-    Examples
-    --------
-    >>> train = load_lidars("semantic2d-mini", features="RA", grid="union")  # doctest: +SKIP
-    """
-    return CombinedLidars(open_dataset(name), lidars=lidars, split=split, **options)

@@ -6,11 +6,10 @@ import torch
 
 from semantic2d_dataset.access.angular_grids import AngularGrid, common_grid
 from semantic2d_dataset.access.histories import History
-from semantic2d_dataset.access.torch_lidars import load_lidars
 from semantic2d_dataset.access.torch_samplers import Shard
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.manifest import publish
-from semantic2d_dataset.loading import load_dataset
+from semantic2d_dataset.loading import load_dataset, load_lidars
 from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW, RPLIDAR_S2, WLR_716
 from tests.generators import SMALL_LIDAR, make_sequence
 
