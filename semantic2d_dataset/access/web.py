@@ -28,6 +28,7 @@ TIMEOUTS_S = (10, 30)
 """To connect, and between bytes."""
 
 _REDIRECTS = 10
+_UNREACHED = "cannot be reached; is there a network, or a proxy to be named in HTTPS_PROXY?"
 _LONGEST_ANSWER = 1 << 26
 _GONE = {400, 401, 404, 405, 406, 410, 414, 416, 451}
 """Statuses that stay. 403 is not among them: some hosts say it to those who ask too often."""
@@ -247,5 +248,5 @@ def _in_words(err: requests.RequestException) -> str:
         return "no answer in time"
     if isinstance(err, (requests.ConnectionError, requests.exceptions.ChunkedEncodingError)):
         broken = isinstance(err, requests.exceptions.ChunkedEncodingError) or "aborted" in str(err)
-        return "the connection broke off" if broken else "cannot be reached"
+        return "the connection broke off" if broken else _UNREACHED
     return " ".join(str(err).split())

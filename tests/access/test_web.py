@@ -72,7 +72,9 @@ def test_redirect_is_followed_with_its_range(host):
 def test_host_that_is_not_there_is_said_in_words():
     with (
         new_session() as session,
-        pytest.raises(AttemptError, match=r"^http://127\.0\.0\.1:9/x: cannot be reached$") as info,
+        pytest.raises(
+            AttemptError, match=r"^http://127\.0\.0\.1:9/x: cannot be reached; is there"
+        ) as info,
         open_url(session, "http://127.0.0.1:9/x"),
     ):
         pass
