@@ -144,7 +144,8 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> None:
     WriteError
         If the folder is missing or cannot be written.
     """
-    from semantic2d_dataset.plotting import plot_confusion, plot_reliability, save
+    from semantic2d_dataset.plotting import save
+    from semantic2d_dataset.plotting_scores import plot_confusion, plot_reliability
 
     folder = Path(folder)
     save(plot_reliability(evaluation.calibration), folder / "reliability.png")

@@ -1,4 +1,4 @@
-"""Pictures of scans, maps and scores in the colours of the classes.
+"""Pictures of scans and maps in the colours of the classes.
 
 Every function takes data and returns a matplotlib `Figure` that no window knows; `save` writes
 it. Lengths are in m and both axes have one scale. Points lie on a thin dark rim, because some
@@ -8,7 +8,7 @@ class colours (Person, Table) are close to white paper.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,14 +29,12 @@ from semantic2d_dataset.scene.geometry import Pose2, to_base, to_points
 from semantic2d_dataset.scene.maps import FREE, OCCUPIED, SemanticMap
 from semantic2d_dataset.scene.scans import Scan, check_array
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, UNLABELLED, Taxonomy
-from semantic2d_dataset.scoring.metrics import class_names, percent
 
 _EDGE = "0.25"
 _FREE_RGB = (255, 255, 255)
 _UNKNOWN_RGB = (232, 238, 244)  # no class is bluish grey
 _OCCUPIED_RGB = (125, 125, 125)  # occupied without a class; Other is black
 _ROBOT = "#d6007f"  # no class is pink
-_IOU, _CA = "#1f4e79", "#9cc3e6"
 
 
 def plot_scan(
@@ -106,93 +104,9 @@ def plot_prediction_beside_truth(
     for ax, (title, labels) in zip(axes, both.items(), strict=True):
         plot_scan(scan, labels, ax=ax, taxonomy=taxonomy)
         ax.set_title(title)
+        ax.set_anchor("S")  # beside the legend, however flat the scan is
     axes[1].set_ylabel("")
     _add_legend(figure, np.concatenate([ids[scan.valid] for ids in both.values()]), taxonomy)
-    return figure
-
-
-def plot_confusion(result: Mapping[str, Any]) -> Figure:
-    """Draw the confusion matrix of a result, every row as percent of its true points.
-
-    Parameters
-    ----------
-    result
-        As `Evaluator.compute` returns it.
-    """
-    names, matrix = class_names(result), np.asarray(result["confusion"], np.float64)
-    support = matrix.sum(axis=1, keepdims=True)
-    shares = 100 * np.divide(matrix, support, out=np.full_like(matrix, np.nan), where=support > 0)
-    figure, ax = _new_figure(8.6, 7.4)
-    picture = ax.imshow(np.nan_to_num(shares), cmap="Blues", vmin=0, vmax=100)
-    for (row, column), share in np.ndenumerate(shares):
-        text = "-" if np.isnan(share) else f"{share:.1f}"
-        colour = "white" if share > 55 else "0.65" if not matrix[row, column] else "black"
-        ax.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
-    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
-    rows = [f"{name} ({int(n):,})" for name, n in zip(names, support[:, 0], strict=True)]
-    ax.set_yticks(range(len(names)), rows)
-    ax.set_xlabel("Predicted class")
-    ax.set_ylabel("True class (points)")
-    figure.colorbar(picture, ax=ax, label="Share of the true class (%)", shrink=0.8)
-    return figure
-
-
-def plot_class_bars(result: Mapping[str, Any]) -> Figure:
-    """Draw IoU and CA of every class as bars; the legend has their means.
-
-    Parameters
-    ----------
-    result
-        As `Evaluator.compute` returns it.
-    """
-    names = class_names(result)
-    figure, ax = _new_figure(10.0, 4.6)
-    at = np.arange(len(names))
-    for key, mean, offset, colour in (("iou", "mIoU", -0.2, _IOU), ("ca", "mCA", 0.2, _CA)):
-        figures = [result[name][key] for name in names]
-        heights = [0.0 if figure is None else 100 * figure for figure in figures]
-        label = f"{key.upper() if key == 'ca' else 'IoU'} ({mean} {percent(result[mean])} %)"
-        bars = ax.bar(at + offset, heights, 0.38, color=colour, label=label)
-        texts = ["none" if figure is None else f"{100 * figure:.0f}" for figure in figures]
-        ax.bar_label(bars, texts, padding=2, fontsize=8)
-    ax.set_xticks(at, names)
-    ax.set_ylim(0, 109)  # room for the figures above full bars
-    ax.set_ylabel("Percent")
-    ax.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper right", ncols=2, frameon=False)
-    return figure
-
-
-def plot_reliability(calibration: Mapping[str, Any]) -> Figure:
-    """Draw accuracy against confidence, and the share of errors against entropy.
-
-    Below each are the points of its bins. Confidence that can be trusted has its bars end on the
-    diagonal; entropy that tells errors has bars that rise.
-
-    Parameters
-    ----------
-    calibration
-        As `Calibration.compute` returns it.
-    """
-    figure = new_empty_figure(11.0, 5.6)
-    axes = figure.subplots(2, 2, sharex="col", height_ratios=(3, 1))
-    reliability, errors = axes.T
-    _draw_bins(reliability, calibration["confidence_bins"], "accuracy")
-    reliability[0].plot((0, 1), (0, 100), color=_EDGE, linestyle="--", linewidth=1, zorder=3)
-    reliability[0].set_title(
-        f"Expected calibration error {percent(calibration['ece'])} %, largest "
-        f"{percent(calibration['mce'])} %",
-        fontsize=10,
-    )
-    reliability[0].set_ylabel("Accuracy (%)")
-    reliability[1].set_xlabel("Confidence")
-    reliability[1].set_ylabel("Points (%)")
-    _draw_bins(errors, calibration["entropy_bins"], "error")
-    errors[0].set_title(
-        f"Area under risk and coverage {percent(calibration['aurc'])} %", fontsize=10
-    )
-    errors[0].set_ylabel("Wrong points (%)")
-    errors[1].set_xlabel("Entropy (nats)")
     return figure
 
 
@@ -322,20 +236,6 @@ def _labels_of(scan: Scan, labels: NDArray[np.uint8] | None) -> NDArray[np.uint8
     if scan.labels is None:
         return np.full(scan.lidar.beams, UNLABELLED, np.uint8)
     return scan.labels
-
-
-def _draw_bins(axes: Sequence[Axes], bins: Sequence[Mapping[str, Any]], figure: str) -> None:
-    """Draw a figure of bins in percent, and below it the share of points that each holds."""
-    low = [row["low"] for row in bins]
-    widths = [row["high"] - row["low"] for row in bins]
-    total = max(sum(row["points"] for row in bins), 1)
-    heights = [100 * (row[figure] or 0.0) for row in bins]
-    shares = [100 * row["points"] / total for row in bins]
-    for ax, values, colour in zip(axes, (heights, shares), (_IOU, _CA), strict=True):
-        ax.bar(low, values, widths, align="edge", color=colour, edgecolor="white", linewidth=0.8)
-        ax.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylim(0, 100)
-    axes[0].set_xlim(0, bins[-1]["high"])
 
 
 def _draw_points(

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from semantic2d_dataset import plotting
+from semantic2d_dataset import plotting, plotting_scores
 from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.format.writing import write_text_atomically
@@ -74,8 +74,8 @@ def write_report(
         result=result,
         means=[(name, percent(result[name])) for name in _MEANS],
         rows=_rows(result, taxonomy),
-        bars=_embed(plotting.plot_class_bars(result)),
-        confusion=_embed(plotting.plot_confusion(result)),
+        bars=_embed(plotting_scores.plot_class_bars(result)),
+        confusion=_embed(plotting_scores.plot_confusion(result)),
         scans=[_show(*each, taxonomy) for each in shown],
         on_map_id=shown[0][0],
         on_map=_embed(_on_map(data, *shown[0][:2], taxonomy)),

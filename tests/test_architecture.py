@@ -21,6 +21,7 @@ ROOMS = (
     "scoring",
     "access",
     "plotting",
+    "plotting_scores",
     "plotting_splits",
     "summaries",
     "reports",

@@ -4,12 +4,9 @@ from matplotlib.image import imread
 
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.plotting import (
-    plot_class_bars,
-    plot_confusion,
     plot_labelled_scan_on_map,
     plot_map,
     plot_prediction_beside_truth,
-    plot_reliability,
     plot_scan,
     save,
 )
@@ -18,8 +15,6 @@ from semantic2d_dataset.scene.lidars import HOKUYO_UTM_30LX_EW as HOKUYO
 from semantic2d_dataset.scene.maps import FREE, OCCUPIED, UNKNOWN, SemanticMap
 from semantic2d_dataset.scene.scans import Scan
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
-from semantic2d_dataset.scoring.calibration import Calibration
-from semantic2d_dataset.scoring.metrics import Evaluator
 
 # (x, y, width, height) in m and class, in a room of 12 by 8 m
 FURNITURE = (
@@ -80,15 +75,6 @@ def guess(labels, seed=1):
     rng = np.random.default_rng(seed)
     wrong = rng.random(labels.size) < 0.12
     return np.where(wrong, rng.choice([1, 4, 7, 9], labels.size), labels).astype(np.uint8)
-
-
-def example_result():
-    rng = np.random.default_rng(2)
-    shares = np.array((0.02, 0.05, 0.1, 0.03, 0.11, 0.02, 0.13, 0.06, 0, 0.48))
-    truth = rng.choice(10, 50_000, p=shares / shares.sum())
-    skill = np.array((0.2, 0.45, 0.7, 0.5, 0.85, 0.6, 0.8, 0.5, 0, 0.95))
-    prediction = np.where(rng.random(truth.size) < skill[truth], truth, rng.integers(0, 10, 50_000))
-    return Evaluator().update(truth, prediction).compute()
 
 
 @pytest.fixture(scope="module")
@@ -166,46 +152,6 @@ def test_prediction_and_truth_share_axes_and_legend(scan):
     assert (left.get_xlim(), left.get_ylim()) == (right.get_xlim(), right.get_ylim())
     assert (drawn_points(left) == drawn_points(right)).all()
     assert len(figure.legends) == 1
-
-
-def test_confusion_shows_percent_of_the_true_class_and_a_dash_for_absent_classes():
-    result = Evaluator().update([1, 1, 1, 1, 2], [1, 1, 1, 9, 2]).compute()
-    ax = plot_confusion(result).axes[0]
-    texts = np.array([text.get_text() for text in ax.texts]).reshape(10, 10)
-    assert (texts[1, 1], texts[1, 9], texts[2, 2]) == ("75.0", "25.0", "100.0")
-    assert set(texts[4]) == {"-"}
-    assert ax.get_yticklabels()[1].get_text() == "Chair (4)"
-
-
-def test_bars_have_the_heights_of_the_scores_and_say_where_there_is_none():
-    result = example_result()
-    ax = plot_class_bars(result).axes[0]
-    heights = np.array([bar.get_height() for bar in ax.patches]).reshape(2, 10)
-    assert heights[0, 4] == pytest.approx(100 * result["Person"]["iou"])
-    assert heights[1, 4] == pytest.approx(100 * result["Person"]["ca"])
-    assert [text.get_text() for text in ax.texts].count("none") == 1
-    assert result["Trash bin"]["ca"] is None
-
-
-def test_reliability_has_the_heights_of_the_bins_and_the_share_of_points_below():
-    rng = np.random.default_rng(0)
-    probabilities = rng.dirichlet(np.full(10, 0.2), (1, 5000)).astype(np.float32)
-    result = Calibration().update(rng.integers(0, 10, (1, 5000)), probabilities).compute()
-    (accuracy, error), (below, _) = np.reshape(plot_reliability(result).axes, (2, 2))
-    for ax, rows, figure in (
-        (accuracy, result["confidence_bins"], "accuracy"),
-        (error, result["entropy_bins"], "error"),
-    ):
-        heights = [bar.get_height() for bar in ax.patches]
-        assert heights == pytest.approx([100 * (row[figure] or 0) for row in rows])
-    assert sum(bar.get_height() for bar in below.patches) == pytest.approx(100)
-    assert accuracy.lines[0].get_xydata().tolist() == [[0, 0], [1, 100]]
-
-
-def test_pictures_of_an_empty_result_can_be_drawn(tmp_path):
-    save(plot_reliability(Calibration().compute()), tmp_path / "reliability.png")
-    for n, plot in enumerate((plot_confusion, plot_class_bars)):
-        save(plot(Evaluator().compute()), tmp_path / f"{n}.png")
 
 
 def test_map_shows_all_known_cells_where_they_are(scene):
