@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 import re
 
 import numpy as np
@@ -15,6 +16,7 @@ from semantic2d_dataset.scoring.metrics import percent
 from semantic2d_dataset.scoring.predictions import PredictionsWriter
 from semantic2d_dataset.scoring.submission import score_predictions
 from semantic2d_dataset.summaries import describe_file, format_summary
+from tests.browsers import CHECK, launched
 from tests.generators import SMALL_LIDAR, make_dataset
 
 
@@ -91,6 +93,19 @@ def test_every_picture_says_what_it_shows_and_every_table_what_it_holds(told):
     assert len(alts) == len(set(alts)) == page.count("<img")
     assert page.count("<table>") == page.count("<caption>") == 1
     assert not re.findall(r"<th(?! scope=)[ >]", page)
+
+
+def test_page_can_be_read_at_any_width_in_light_and_dark(told, tmp_path):
+    (tmp_path / "report.html").write_text(told[0], encoding="utf-8")
+    with launched() as browser:
+        for width, scheme in itertools.product((1280, 390), ("light", "dark")):
+            size = {"width": width, "height": 800}
+            page = browser.new_context(viewport=size, color_scheme=scheme).new_page()
+            said = []
+            page.on("console", lambda message, said=said: said.append(message.text))
+            page.goto((tmp_path / "report.html").as_uri())
+            assert page.evaluate(CHECK) == []
+            assert said == []
 
 
 def test_page_of_two_lidars_in_one_block_tells_them_apart_and_has_no_intervals(tmp_path):
