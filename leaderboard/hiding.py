@@ -54,8 +54,15 @@ def hide_labels(data: OpenDataset, public: Path, private: Path, *, scheme: str =
     Raises
     ------
     InvalidInputError
-        If a folder is there already, a sequence has no labels, or nothing would be hidden.
+        If a folder is there already or lies in the other, a sequence has no labels, or nothing
+        would be hidden.
     """
+    public, private = public.resolve(), private.resolve()
+    if public.is_relative_to(private) or private.is_relative_to(public):
+        raise InvalidInputError(
+            f"{private}: is {public}, or one lies in the other; the private labels would go out "
+            "with the public scans: choose two folders side by side"
+        )
     division = data.scheme(scheme)
     for folder in (public, private):
         if folder.exists():
@@ -66,8 +73,8 @@ def hide_labels(data: OpenDataset, public: Path, private: Path, *, scheme: str =
             f"{data.manifest.name}: every scan of scheme {scheme} is in train or val; "
             "there is nothing to hide"
         )
-    make_folder(private.resolve(), _maker(data, division, _write_private), lambda: False)
-    make_folder(public.resolve(), _maker(data, division, _write_public), lambda: False)
+    make_folder(private, _maker(data, division, _write_private), lambda: False)
+    make_folder(public, _maker(data, division, _write_public), lambda: False)
     return hidden
 
 

@@ -64,3 +64,10 @@ def test_folders_that_are_there_are_refused(divided, dataset_folder, tmp_path):
     with pytest.raises(InvalidInputError, match="exists already"):
         hide_labels(open_dataset(dataset_folder), tmp_path / "public", folder / "private")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("public", "private"), [("x", "x"), ("x", "x/in"), ("x/in", "x")])
+def test_private_labels_never_lie_in_the_public_folder(dataset_folder, tmp_path, public, private):
+    with pytest.raises(InvalidInputError, match="side by side"):
+        hide_labels(open_dataset(dataset_folder), tmp_path / public, tmp_path / "." / private)
+    assert not list(tmp_path.iterdir())
