@@ -12,6 +12,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import json
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,8 +29,21 @@ from semantic2d_dataset.scoring.submission import score_predictions
 STEP = 0.01
 """Step of mIoU, fraction: about what a confidence interval of a small test set is wide."""
 
+_SMALLEST_STEP = 0.0001  # of a finer one, rounding hides nothing
 _START = "0" * 64
-_KEYS = ("number", "at", "submitter", "task", "predictions", "step", "mIoU", "mCA", "better")
+_LINE = {
+    "number": int,
+    "at": str,
+    "submitter": str,
+    "task": str,
+    "predictions": str,
+    "step": float,
+    "mIoU": float,
+    "mCA": float,
+    "better": bool,
+    "before": str,
+    "digest": str,
+}
 _TASK = ("dataset", "dataset_version", "scheme", "split", "lidars")
 
 
@@ -92,23 +106,32 @@ def score_privately(
     SubmissionError
         If the predictions cannot be scored; that is not counted.
     InvalidInputError
-        If the submitter has no name or no submission left, or the step is another one.
+        If the submitter has no name or no submission left, the step is another one, or the data
+        set has no label to score against.
     CorruptFileError
         If the ledger was changed.
+    WriteError
+        If it cannot be written.
     """
     if not submitter.strip() or not submitter.isprintable() or len(submitter) > 200:
         raise InvalidInputError(f"{submitter!r}: expected a name of one line")
-    if not 0 < step < 1:
-        raise InvalidInputError(f"step: expected a fraction between 0 and 1, found {step}")
+    if not _SMALLEST_STEP <= step < 1:
+        raise InvalidInputError(
+            f"step: expected a fraction from {_SMALLEST_STEP} to below 1, found {step}"
+        )
     check_target(ledger, (predictions,), force=True)
     _check_limits(read_ledger(ledger), ledger, submitter, step, per_day)  # before any work
     result = score_predictions(predictions, private)
+    if not result["points"]:  # as in the public part
+        raise InvalidInputError(
+            f"{private.root}: has no label of what was predicted; "
+            "give the folder of the private labels"
+        )
     with FileLock(ledger.with_name(f"{ledger.name}.lock")):
         lines = read_ledger(ledger)
         _check_limits(lines, ledger, submitter, step, per_day)
         line = _next_line(lines, result, submitter, step, file_digest(predictions))
-        text = "".join(f"{json.dumps(each, ensure_ascii=False)}\n" for each in [*lines, line])
-        write_text_atomically(ledger, text)
+        write_text_atomically(ledger, "".join(f"{_text_of(each)}\n" for each in [*lines, line]))
     return line
 
 
@@ -125,10 +148,12 @@ def read_ledger(path: Path, *, head: str | None = None) -> list[dict[str, Any]]:
     Raises
     ------
     CorruptFileError
-        If a line was changed, moved, put in or taken out.
+        If a line was changed, moved, put in or taken out, or it is no ledger at all.
     """
     if not path.exists():
         return []
+    if not path.is_file():  # a pipe would be waited for
+        raise CorruptFileError(f"{path}: expected a ledger, found no file")
     lines: list[dict[str, Any]] = []
     before = _START
     for number, text in enumerate(path.read_bytes().splitlines(), start=1):
@@ -136,13 +161,17 @@ def read_ledger(path: Path, *, head: str | None = None) -> list[dict[str, Any]]:
             line = load_json(text)
         except InvalidInputError as err:
             raise CorruptFileError(f"{path}: line {number}: {err}") from err
-        if not isinstance(line, dict) or set(line) != {*_KEYS, "before", "digest"}:
+        if not isinstance(line, dict) or list(line) != list(_LINE):
             raise CorruptFileError(f"{path}: line {number}: no line of a ledger")
-        if line["before"] != before or line["digest"] != _digest(line) or line["number"] != number:
+        # also the text: of a member that stands there twice, people may read the other one
+        as_made = line["digest"] == _digest(line) and text == _text_of(line).encode()
+        if not as_made or line["before"] != before or line["number"] != number:
             raise CorruptFileError(
                 f"{path}: line {number}: was changed, or one before it was; "
                 "go back to a copy whose last digest was published"
             )
+        if any(type(line[name]) is not kind for name, kind in _LINE.items()):
+            raise CorruptFileError(f"{path}: line {number}: no line of a ledger")
         before = line["digest"]
         lines.append(line)
     if head is not None and head not in [line["digest"] for line in lines]:
@@ -152,7 +181,7 @@ def read_ledger(path: Path, *, head: str | None = None) -> list[dict[str, Any]]:
 
 def bests_of(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the best line of each submitter and task, best first: what may be published."""
-    found = {(line["task"], line["submitter"]): line for line in lines if line["better"]}
+    found = {(line["task"], _who(line["submitter"])): line for line in lines if line["better"]}
     return sorted(found.values(), key=lambda line: (line["task"], -line["mIoU"], line["number"]))
 
 
@@ -168,7 +197,7 @@ def _next_line(
     own = [
         line
         for line in lines
-        if (line["submitter"], line["task"]) == (submitter, task) and line["better"]
+        if (_who(line["submitter"]), line["task"]) == (_who(submitter), task) and line["better"]
     ]
     best = own[-1] if own else None
     # no class of the truth has a score: as bad as can be
@@ -200,7 +229,8 @@ def _check_limits(
             "a smaller one later tells what the ledger was to hide"
         )
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    own = [line for line in lines if line["submitter"] == submitter and line["at"][:10] == today]
+    mine = [line for line in lines if _who(line["submitter"]) == _who(submitter)]
+    own = [line for line in mine if line["at"][:10] == today]
     if per_day is not None and len(own) >= per_day:
         raise InvalidInputError(
             f"{submitter}: has had {len(own)} of {per_day} submissions today (UTC); "
@@ -208,8 +238,17 @@ def _check_limits(
         )
 
 
+def _who(submitter: str) -> str:
+    """Return what names of one submitter share, however their letters and spaces are typed."""
+    return " ".join(unicodedata.normalize("NFKC", submitter).casefold().split())
+
+
 def _rounded(score: float, step: float) -> float:
-    return round(round(score / step) * step, 9)
+    return min(round(round(score / step) * step, 9), 1.0)  # 1 need not be a multiple of the step
+
+
+def _text_of(line: Mapping[str, Any]) -> str:
+    return json.dumps(line, ensure_ascii=False)
 
 
 def _digest(line: Mapping[str, Any]) -> str:

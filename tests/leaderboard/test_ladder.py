@@ -1,4 +1,6 @@
+import hashlib
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -6,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from leaderboard.hiding import hide_labels
 from leaderboard.ladder import bests_of, climb, read_ledger, score_privately
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, SubmissionError
@@ -48,6 +51,15 @@ def test_every_submitter_climbs_alone(ask, tmp_path):
     assert [line["submitter"] for line in bests] == ["ann", "bob"]
 
 
+@pytest.mark.parametrize("other", ["Ann Lee", " ann  lee ", "\uff41nn lee"])
+def test_a_submitter_is_the_same_however_the_name_is_typed(ask, tmp_path, other):
+    ask("good", "ann lee", per_day=1)
+    with pytest.raises(InvalidInputError, match="1 of 1 submissions today"):
+        ask("fair", other, per_day=1)
+    assert not ask("fair", other)["better"]
+    assert len(bests_of(read_ledger(tmp_path / "ledger.json"))) == 1
+
+
 def test_submissions_of_a_day_are_limited(ask):
     ask("poor", per_day=2)
     ask("fair", per_day=2)
@@ -62,7 +74,10 @@ def test_a_ledger_keeps_its_step(ask):
         ask("fair", step=0.0001)
 
 
-@pytest.mark.parametrize("options", [{"step": 0}, {"step": 1.5}, {"submitter": " "}])
+@pytest.mark.parametrize(
+    "options",
+    [*({"step": step} for step in (0, -1, 1.5, 1e-320, float("nan"))), {"submitter": " "}],
+)
 def test_wrong_questions_are_refused(ask, options):
     with pytest.raises(InvalidInputError):
         ask("poor", **options)
@@ -74,6 +89,16 @@ def test_predictions_that_cannot_be_scored_are_not_counted(ask, tmp_path, predic
     with pytest.raises((SubmissionError, FileNotFoundError, CorruptFileError)):
         ask("none")
     assert (tmp_path / "ledger.json").read_bytes() == before
+
+
+def test_labels_that_hide_everything_tell_nothing_and_cost_nothing(
+    dataset_folder, predictions_folder, tmp_path
+):
+    hide_labels(open_dataset(dataset_folder), tmp_path / "public", tmp_path / "private")
+    public, ledger = open_dataset(tmp_path / "public"), tmp_path / "ledger.json"
+    with pytest.raises(InvalidInputError, match="has no label of what was predicted"):
+        score_privately(predictions_folder / "good.h5", public, ledger, "ann")
+    assert not ledger.exists()
 
 
 def test_any_change_to_any_line_is_found(ask, tmp_path):
@@ -93,6 +118,32 @@ def test_any_change_to_any_line_is_found(ask, tmp_path):
         path.write_text("\n".join(lines[n] for n in order) + "\n")
         with pytest.raises(CorruptFileError):
             read_ledger(path)
+
+
+def test_a_figure_that_only_people_would_read_is_found(ask, tmp_path):
+    ask("good")
+    path = tmp_path / "ledger.json"
+    path.write_text(path.read_text().replace('"mIoU"', '"mIoU": 1.0, "mIoU"'))
+    with pytest.raises(CorruptFileError):
+        read_ledger(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("at", 1), ("task", []), ("submitter", None), ("mIoU", "1"), ("better", 1)]
+)
+def test_a_forged_line_of_other_types_is_refused(ask, tmp_path, name, value):
+    line = ask("good") | {name: value}
+    said = {key: each for key, each in line.items() if key != "digest"}
+    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    (tmp_path / "ledger.json").write_text(json.dumps(line | {"digest": digest}) + "\n")
+    with pytest.raises(CorruptFileError, match="no line of a ledger"):
+        read_ledger(tmp_path / "ledger.json")
+
+
+def test_a_ledger_that_is_no_file_is_refused_at_once(ask, tmp_path):
+    os.mkfifo(tmp_path / "ledger.json")
+    with pytest.raises(CorruptFileError, match="found no file"):
+        ask("good")
 
 
 def test_a_published_digest_tells_of_lines_that_were_cut_off(ask, tmp_path):
@@ -119,6 +170,11 @@ def test_two_at_once_lose_no_line(ask, tmp_path):
         list(pool.map(lambda n: ask("fair", f"s{n}"), range(8)))
     lines = read_ledger(tmp_path / "ledger.json")
     assert sorted(line["submitter"] for line in lines) == [f"s{n}" for n in range(8)]
+
+
+@given(st.floats(0, 1), st.floats(0.0001, 0.99))
+def test_what_is_told_is_a_fraction_whatever_the_step(score, step):
+    assert 0 <= climb(None, score, step) <= 1
 
 
 @given(st.lists(st.floats(0, 1), max_size=50), st.sampled_from([0.001, 0.01, 0.05]))
