@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import requests
 from tqdm import tqdm
 
-from leaderboard.entries import Entry
+from leaderboard.entries import Entry, file_digest
 from semantic2d_dataset.access.web import new_session, open_url, persist
 from semantic2d_dataset.errors import ChecksumError, DownloadError, InvalidInputError
 from semantic2d_dataset.format.writing import write_bytes_atomically
@@ -40,25 +40,27 @@ def fetch_predictions(
     Raises
     ------
     InvalidInputError
-        If the host is not one of those.
+        If the host is not one of those, or the address is none.
     DownloadError
         If the file cannot be had, or is too large.
     ChecksumError
-        If it is not the file that was scored.
+        If it is not the file that was scored, or another one has its place in the folder.
     """
     url = entry.said.get("predictions_url")
     if url is None:
         return None
     path = folder / f"{entry.digest}.h5"
     if path.exists():
+        if not path.is_file() or file_digest(path) != entry.digest:
+            raise ChecksumError(f"{path}: is not the file that its name says; remove it")
         return path
-    host = urlsplit(url).hostname
+    asked, host = _address_of(entry, url)
     if hosts and host not in hosts:
         raise InvalidInputError(
             f"{entry.path}: predictions_url: {host} is none of {', '.join(hosts)}"
         )
     with new_session() as session:
-        content = persist(lambda: _get(session, url, most_bytes))
+        content = persist(lambda: _get(session, asked, most_bytes))
     found = hashlib.sha256(content).hexdigest()
     if found != entry.digest:
         raise ChecksumError(
@@ -66,6 +68,18 @@ def fetch_predictions(
         )
     write_bytes_atomically(path, content)
     return path
+
+
+def _address_of(entry: Entry, url: str) -> tuple[str, str]:
+    r"""Return the address that will really be asked, and its host.
+
+    Parsers differ in what the host of ``https://one\@other/`` is.
+    """
+    try:
+        asked = str(requests.Request("GET", url).prepare().url)
+    except (requests.RequestException, ValueError) as err:
+        raise InvalidInputError(f"{entry.path}: predictions_url: {err}") from err
+    return asked, urlsplit(asked).hostname or ""
 
 
 def _get(session: requests.Session, url: str, most_bytes: int) -> bytes:

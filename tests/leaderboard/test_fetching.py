@@ -52,6 +52,33 @@ def test_only_the_hosts_that_are_allowed_are_asked(host, tmp_path):
     assert host.requests == []
 
 
+@pytest.mark.parametrize("url", ["https://{}\\@zenodo.org/p.h5", "https://{}\\.zenodo.org/p.h5"])
+def test_no_way_to_write_an_address_gets_past_the_allowed_hosts(host, tmp_path, url):
+    url = url.format(host.url.removeprefix("http://"))
+    entry = Entry(Path("x.json"), {"predictions_url": url, "digests": {"predictions": "0" * 64}})
+    with pytest.raises(InvalidInputError, match=r"127\.0\.0\.1 is none of zenodo\.org"):
+        fetch_predictions(entry, tmp_path, most_bytes=5000, hosts=("zenodo.org",))
+    assert host.requests == []
+
+
+@pytest.mark.parametrize(
+    "url", ["https://[", "https://a..b/", "https://:1/", "https://h:99999999/"]
+)
+def test_what_is_no_address_is_refused(tmp_path, url):
+    entry = Entry(Path("x.json"), {"predictions_url": url, "digests": {"predictions": "0" * 64}})
+    with pytest.raises(InvalidInputError, match="predictions_url"):
+        fetch_predictions(entry, tmp_path, most_bytes=5000, hosts=("zenodo.org",))
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_another_file_under_the_name_of_a_digest_is_not_taken_for_it(host, tmp_path, folder):
+    place = tmp_path / f"{'0' * 64}.h5"
+    place.mkdir() if folder else place.write_bytes(b"x")
+    with pytest.raises(ChecksumError, match="not the file that its name says"):
+        fetch_predictions(entry_of(host, "0" * 64), tmp_path, most_bytes=5000)
+    assert host.requests == []
+
+
 def test_an_entry_that_points_nowhere_gets_nothing(tmp_path):
     entry = Entry(Path("x.json"), {"digests": {"predictions": "0" * 64}})
     assert fetch_predictions(entry, tmp_path, most_bytes=1) is None
