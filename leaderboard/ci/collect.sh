@@ -5,7 +5,9 @@
 #
 # Only new entries and new predictions may be added; anything else needs the eyes of a person.
 set -euo pipefail
+export LC_ALL=C # in some languages [a-z] holds capitals, too
 
+(($# == 3)) || { echo "usage: collect.sh BASE HEAD OUT" >&2; exit 2; }
 base=$1 head=$2 out=$3
 most_bytes=${MOST_BYTES:-104857600}
 most_files=${MOST_FILES:-20}
@@ -16,7 +18,9 @@ refuse() {
   exit 1
 }
 
-mkdir -p "$out/entries" "$out/predictions"
+[[ ! -e $out && ! -L $out ]] || refuse "$out" "is there already: files of other submissions may be in it"
+trap 'rm -rf -- "$out"' EXIT # of a submission that is refused, nothing stays
+mkdir -p -- "$out/entries" "$out/predictions"
 # a file, because a failure inside <() would pass for an empty list
 git diff --no-ext-diff --no-textconv --no-renames --name-status -z "$base...$head" > "$out/changes"
 while IFS= read -r -d '' status && IFS= read -r -d '' path; do
@@ -37,4 +41,5 @@ while IFS= read -r -d '' status && IFS= read -r -d '' path; do
 done < "$out/changes"
 rm "$out/changes"
 ((files > 0)) || refuse "$head" "adds nothing"
+trap - EXIT
 echo "$files files collected"

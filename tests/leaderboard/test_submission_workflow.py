@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 
 import pytest
@@ -37,6 +38,17 @@ def test_only_the_base_branch_is_checked_out(workflow):
 def test_no_text_of_the_pull_request_stands_in_a_script(workflow):
     for step in workflow["jobs"]["score"]["steps"]:
         assert "${{" not in step.get("run", "")
+
+
+def test_an_older_branch_with_older_scripts_is_no_way_in(workflow):
+    assert workflow[True]["pull_request_target"]["branches"] == ["main"]  # "on" is true in YAML
+
+
+def test_what_is_printed_of_a_submission_is_no_command_to_the_runner(workflow):
+    runs = [step["run"] for step in workflow["jobs"]["score"]["steps"] if "run" in step]
+    for run in runs:
+        if "semantic2d" in run or "collect.sh" in run:
+            assert run.startswith('echo "::stop-commands::$(uuidgen)"\n')
 
 
 def git(folder, *words):
@@ -119,6 +131,54 @@ def test_anything_else_is_refused(repository, path, content, message):
     assert not (repository / "pwned").exists()
 
 
+def test_of_a_submission_that_is_refused_nothing_stays(repository):
+    found = collect(repository, {"submissions/a.h5": b"x", "submissions/b.h5": None})
+    assert "submissions/b.h5: not a plain file" in found.stderr
+    assert not (repository.parent / "incoming").exists()
+
+
+def test_files_of_another_submission_are_not_scored_with_it(repository):
+    stale = repository.parent / "incoming" / "predictions" / "stale.h5"
+    stale.parent.mkdir(parents=True)
+    stale.write_bytes(b"theirs")
+    found = collect(repository, {"submissions/mine.h5": b"x"})
+    assert (found.returncode, stale.read_bytes()) == (1, b"theirs")
+    assert "is there already" in found.stderr
+
+
+@pytest.mark.parametrize("hide", ["submodule", "executable", "folder link", "history"])
+def test_no_trick_of_git_brings_in_anything_else(repository, hide):
+    base = git(repository, "rev-parse", "HEAD")
+    (repository / "submissions").mkdir()
+    mine = repository / "submissions" / "a.h5"
+    mine.write_bytes(b"x")
+    if hide == "submodule":
+        mine.unlink()
+        git(repository, "update-index", "--add", "--cacheinfo", f"160000,{base},submissions/a.h5")
+    elif hide == "executable":
+        mine.chmod(0o755)
+    elif hide == "folder link":
+        shutil.rmtree(repository / "leaderboard")
+        (repository / "leaderboard").symlink_to("/etc")
+    elif hide == "history":
+        git(repository, "checkout", "--quiet", "--orphan", "other")
+    if hide != "submodule":
+        git(repository, "add", "--all")
+    git(repository, "commit", "--quiet", "-m", "head")
+    out = repository.parent / "incoming"
+    words = [str(CI / "collect.sh"), base, "HEAD", str(out)]
+    assert subprocess.run(words, cwd=repository, capture_output=True, check=False).returncode != 0
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("words", [[], ["HEAD"], ["HEAD", "HEAD"], ["HEAD"] * 4])
+def test_wrong_usage_says_how(repository, words):
+    found = subprocess.run(
+        [str(CI / "collect.sh"), *words], cwd=repository, capture_output=True, check=False
+    )
+    assert (found.returncode, found.stderr) == (2, b"usage: collect.sh BASE HEAD OUT\n")
+
+
 def test_many_files_are_refused(repository):
     files = {f"submissions/{n}.h5": b"x" for n in range(4)}
     assert "more than 3 files" in collect(repository, files, MOST_FILES="3").stderr
@@ -137,7 +197,7 @@ def test_a_submission_of_nothing_is_refused(repository):
 def test_every_command_of_the_recipe_exists(workflow):
     runs = "\n".join(step.get("run", "") for step in workflow["jobs"]["score"]["steps"])
     found = re.findall(r"semantic2d leaderboard (\w+)((?:\\\n|[^\n|;])*)", runs)
-    assert [command for command, _ in found] == ["add", "fetch", "check"]
+    assert [command for command, _ in found] == ["add", "fetch", "check", "check"]
     for command, options in found:
         said = CliRunner().invoke(app, [command, "--help"]).stdout
         for option in re.findall(r"--[a-z-]+", options):
