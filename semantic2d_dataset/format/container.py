@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -309,16 +310,27 @@ def _plain_value(value: Any) -> Any:
 def load_json(text: str | bytes) -> Any:
     """Parse JSON that came from elsewhere: finite numbers, Unicode text, no absurd depth.
 
+    Nor does a member stand twice in an object: readers differ in which one they believe.
+
     Raises
     ------
     InvalidInputError
         If it is anything else.
     """
     try:
-        value = json.loads(text, parse_constant=_refuse_constant)
+        value = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_twins)
         json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as err:
         raise InvalidInputError(f"not JSON: {err}") from err
+    return value
+
+
+def _refuse_twins(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    value = dict(members)
+    if len(value) < len(members):
+        counts = Counter(name for name, _ in members)
+        twice = next(name for name, count in counts.items() if count > 1)
+        raise ValueError(f"{twice[:80]!r} stands there more than once")
     return value
 
 

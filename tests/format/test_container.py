@@ -13,7 +13,7 @@ from semantic2d_dataset.errors import (
     Semantic2DError,
     UnsafeFileError,
 )
-from semantic2d_dataset.format.container import ContainerReader
+from semantic2d_dataset.format.container import ContainerReader, load_json
 from semantic2d_dataset.format.schema import SEQUENCE
 from semantic2d_dataset.format.sequence import SequenceReader
 from tests.generators import make_sequence
@@ -262,3 +262,9 @@ def test_reading_everything_reads_every_chunk(good, tmp_path):
     path.write_bytes(data)
     with pytest.raises(CorruptFileError, match="truncated or damaged"):
         check_all(path)
+
+
+@pytest.mark.parametrize("text", ['{"a": 1, "a": 1}', '[{"b": {"a": 1, "\\u0061": 2}}]'])
+def test_json_in_which_a_member_stands_twice_is_refused(text):
+    with pytest.raises(InvalidInputError, match="'a' stands there more than once"):
+        load_json(text)
