@@ -84,8 +84,8 @@ def reliability_of(result: Mapping[str, Any]) -> Chart | None:
     calibration = result.get("calibration")
     if not calibration:
         return None
-    bins = [each for each in calibration["confidence_bins"] if each["points"]]
-    points = [(_x(each["confidence"]), _y(each["accuracy"])) for each in bins]
+    bins = [(each["confidence"], each["accuracy"]) for each in calibration["confidence_bins"]]
+    points = [(_x(sure), _y(right)) for sure, right in bins if None not in (sure, right)]
     diagonal = [(_x(0.0), _y(0.0)), (_x(1.0), _y(1.0))]
     ticks = tuple((_x(tenths / 10), f"{10 * tenths} %") for tenths in range(0, 11, 2))
     curves = (_curve("Perfect", diagonal), _curve("Measured", points))

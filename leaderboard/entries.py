@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -190,6 +191,8 @@ def read_entry(path: Path) -> Entry:
         If it was written in a newer major format.
     """
     path = Path(path)
+    if os.path.lexists(path) and not path.is_file():  # a pipe would be waited for
+        raise CorruptFileError(f"{path}: expected a file")
     with path.open("rb") as stream:
         content = stream.read(_MAX_BYTES + 1)
     if len(content) > _MAX_BYTES:

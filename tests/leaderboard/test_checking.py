@@ -1,4 +1,5 @@
 import json
+import os
 import shutil
 
 import pytest
@@ -49,6 +50,28 @@ def test_no_entry_that_comes_with_the_project_is_wrong(mini):
     assert {each.status for each in found} == {UNVERIFIED, AS_PUBLISHED}, format_check(found)
     reasons = {each.reason for each in found if each.status == UNVERIFIED}
     assert reasons == {"its predictions are not at hand"}  # data set and evaluator are the entries'
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "broken link", "device"])
+def test_what_is_no_file_is_named_and_stops_no_other_entry(board, at_hand, kind):
+    path = board / "a--b.json"
+    make = {
+        "pipe": lambda: os.mkfifo(path),
+        "folder": path.mkdir,
+        "broken link": lambda: path.symlink_to("nowhere"),
+        "device": lambda: path.symlink_to("/dev/zero"),
+    }
+    make[kind]()
+    found = check_entries(board, at_hand)
+    assert [each.status for each in found] == [WRONG, VERIFIED, VERIFIED, VERIFIED]
+    assert found[0].problems == (("the file", "expected a file"),)
+
+
+def test_a_figure_that_stands_twice_is_refused(board):
+    path, _ = one_of(board)
+    path.write_text(path.read_text().replace('"mIoU":', '"mIoU": 0.99, "mIoU":', 1))
+    (problem,) = check_entry(path, AtHand()).problems
+    assert problem == ("the file", "not JSON: 'mIoU' stands there more than once")
 
 
 def test_the_published_rows_are_as_published(tmp_path):

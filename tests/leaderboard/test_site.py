@@ -161,6 +161,14 @@ def test_pages_are_well_formed_and_name_nothing_outside(board, at_hand, tmp_path
             ET.fromstring(svg)
 
 
+def test_a_bin_without_figures_is_not_drawn(board, tmp_path):
+    path, said = first(board)
+    said = with_extras(said)
+    said["result"]["calibration"]["confidence_bins"][-1]["points"] = 7
+    path.write_text(to_json(seal(said)))
+    assert build_site(tmp_path / "site", board, AtHand()) == 3
+
+
 def test_conditions_intervals_and_calibration_are_shown(board, tmp_path):
     path, said = first(board)
     path.write_text(to_json(with_extras(said)))
