@@ -264,9 +264,16 @@ def metadata_problems(metadata: Any) -> list[str]:
     """List what keeps metadata from fitting ``metadata.schema.json``."""
     found = jsonschema.Draft202012Validator(metadata_schema()).iter_errors(metadata)
     return [
-        f"metadata{_cut(error.json_path.removeprefix('$'))}: {_cut(error.message)}"
+        f"metadata{_cut(error.json_path.removeprefix('$'))}: {_in_words(error)}"
         for error in islice(found, _PROBLEMS)
     ]
+
+
+def _in_words(error: jsonschema.ValidationError) -> str:
+    if error.validator != "pattern":
+        return _cut(error.message)
+    schema: Any = error.schema
+    return f"{_cut(repr(error.instance))}: expected {schema['description']}"
 
 
 def _cut(text: str) -> str:

@@ -25,6 +25,7 @@ from semantic2d_dataset.scene.lidars import LidarSpec
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
 from semantic2d_dataset.scoring import tallies
 from semantic2d_dataset.scoring.metrics import EVALUATOR_VERSION, Evaluator
+from semantic2d_dataset.scoring.predictions import metadata_problems
 from semantic2d_dataset.scoring.submission import (
     PredictionsReader,
     PredictionsWriter,
@@ -205,6 +206,27 @@ def test_writer_refuses_what_the_validator_would(tmp_path, arguments, message):
 def test_writer_refuses_metadata_that_do_not_fit_the_schema(tmp_path, metadata):
     with pytest.raises(InvalidInputError, match="metadata"):
         writer_of(tmp_path / "p.h5", metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *(f"S3{hidden}-Net" for hidden in "\u00ad\u061c\u115f\u180e\u200b\u202e\u3164\ufe0f"),
+        *("S3-Net\U000e0041", "S3-Net ", " S3-Net", "S3-Net\u00a0", " ", ""),
+    ],
+)
+def test_no_method_is_called_what_looks_like_the_name_of_another(method):
+    assert "metadata.method" in metadata_problems({"method": method})[0]
+    assert "metadata.authors[0]" in metadata_problems({"method": "M", "authors": [method]})[0]
+
+
+def test_names_are_of_any_language_and_a_bad_one_is_told_in_words():
+    names = ["\u674e \u96f7", "Zo\u00eb", "\u0411\u043e\u0440\u0438\u0441"]
+    assert metadata_problems({"method": "\u7f51 2", "authors": names}) == []
+    (problem,) = metadata_problems({"method": "S3\u200b-Net"})
+    assert problem == (
+        "metadata.method: 'S3\\u200b-Net': expected text without control or invisible characters"
+    )
 
 
 def test_writer_says_that_the_folder_is_missing(tmp_path):
