@@ -43,18 +43,19 @@ def score(
     submitter: Annotated[str, typer.Option("--submitter", help="Who asks.")],
     *,
     step: Annotated[
-        float, typer.Option(help="A new mIoU is told only where better by this fraction.")
-    ] = 0.01,
+        float | None, typer.Option(help="A new mIoU is told only where better by this fraction.")
+    ] = None,
     per_day: Annotated[
         int | None, typer.Option(min=1, help="Submissions that each has on a day (UTC).")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Score predictions, and say only what the ledger lets be told."""
-    from leaderboard.ladder import score_privately
+    from leaderboard.ladder import STEP, score_privately
     from semantic2d_dataset.access.registry import open_dataset
     from semantic2d_dataset.scoring.metrics import percent
 
+    step = STEP if step is None else step
     line = score_privately(
         predictions, open_dataset(labels), ledger, submitter, step=step, per_day=per_day
     )
