@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from leaderboard.entries import (
     seal,
     to_json,
 )
+from leaderboard.seeds import summarise
 from semantic2d_dataset.errors import InvalidInputError, Semantic2DError
 from semantic2d_dataset.format.writing import write_text_atomically
 from semantic2d_dataset.scoring.submission import ScoredDataset, score_predictions
@@ -57,6 +58,41 @@ def make_entry(
     return entry_of(result, dataset, kind=kind, url=url, where=Path(predictions))
 
 
+def make_entry_of_seeds(
+    predictions: Sequence[Path],
+    dataset: ScoredDataset,
+    *,
+    urls: Sequence[str] = (),
+    scheme: str | None = None,
+    split: str | None = None,
+) -> dict[str, Any]:
+    """Score predictions of several trainings of one method, and return the one entry of them.
+
+    Parameters
+    ----------
+    predictions
+        Two predictions files or more; the entry does not depend on their order.
+    dataset
+        The data set that they are for.
+    urls
+        Where others get each of them (https), in the same order; empty if nowhere.
+    scheme, split
+        What to score, where the files do not say.
+
+    Raises
+    ------
+    SubmissionError
+        If predictions cannot be scored.
+    InvalidInputError
+        If they are not trainings of one method on one task, two are the same, or what they say of
+        themselves has no place in an entry.
+    """
+    results = [score_predictions(p, dataset, scheme=scheme, split=split) for p in predictions]
+    shown, seeds = summarise(results, urls)
+    where = Path(predictions[0])
+    return entry_of(shown, dataset, kind=SCORED, url=None, where=where, seeds=seeds)
+
+
 def entry_of(
     result: Mapping[str, Any],
     dataset: ScoredDataset,
@@ -64,6 +100,7 @@ def entry_of(
     kind: str,
     url: str | None,
     where: Path,
+    seeds: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Turn a result of `score_predictions` into an entry; `where` is for messages."""
     said = result["submission"]
@@ -89,6 +126,8 @@ def entry_of(
     }
     if url is not None:
         entry["predictions_url"] = url
+    if seeds is not None:
+        entry["seeds"] = seeds
     entry = seal(entry)
     problems = schema_problems(entry)
     if problems:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -34,7 +35,9 @@ def leaderboard() -> None:
 
 @app.command()
 def add(
-    predictions: Annotated[Path, typer.Argument(help="Predictions file.")],
+    predictions: Annotated[
+        list[Path], typer.Argument(help="Predictions file; several are seeds of one method.")
+    ],
     *,
     entries: _Entries = _ENTRIES,
     data: Annotated[
@@ -43,7 +46,8 @@ def add(
     scheme: Annotated[str | None, typer.Option(help="Split scheme; else as it says.")] = None,
     split: Annotated[str | None, typer.Option(help="Split; else as the file says.")] = None,
     url: Annotated[
-        str | None, typer.Option(help="Where others get this very file (https).")
+        list[str] | None,
+        typer.Option(help="Where others get this very file (https); repeat it in their order."),
     ] = None,
     sanity_row: Annotated[
         bool, typer.Option("--sanity", help="A row to compare with, not to rank.")
@@ -53,27 +57,56 @@ def add(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Score predictions, and write their entry."""
-    from leaderboard.adding import add_entry, make_entry
+    """Score predictions, and write their entry.
+
+    Several files are seeds of one method: it is ranked by their mean, and the one with the median
+    mIoU is shown in full.
+    """
+    from leaderboard.adding import add_entry, make_entry, make_entry_of_seeds
     from leaderboard.entries import SANITY, SCORED
     from semantic2d_dataset.access.registry import open_dataset
-    from semantic2d_dataset.scoring.metrics import percent
     from semantic2d_dataset.scoring.predictions import PredictionsReader
 
+    urls, several = url or [], len(predictions) > 1
+    if urls and len(urls) != len(predictions):
+        raise typer.BadParameter(
+            f"{len(predictions)} predictions and {len(urls)} addresses: give one --url for each, "
+            "in their order, or none"
+        )
+    if sanity_row and several:
+        raise typer.BadParameter("--sanity is for one file: a sanity row has no seeds")
     _check_entries(entries)
-    with PredictionsReader(predictions) as reader:
+    with PredictionsReader(predictions[0]) as reader:
         name = data or reader.dataset
     if not name:
-        raise InvalidInputError(f"{predictions}: does not name its data set; say it with --data")
-    kind = SANITY if sanity_row else SCORED
-    entry = make_entry(
-        predictions, open_dataset(name), kind=kind, url=url, scheme=scheme, split=split
-    )
+        raise InvalidInputError(f"{predictions[0]}: does not name its data set; say it with --data")
+    found, asked = open_dataset(name), {"scheme": scheme, "split": split}
+    if several:
+        entry = make_entry_of_seeds(predictions, found, urls=urls, **asked)
+    else:
+        kind, place = SANITY if sanity_row else SCORED, urls[0] if urls else None
+        entry = make_entry(predictions[0], found, kind=kind, url=place, **asked)
     path = add_entry(entry, entries, force=force)
-    result = entry["result"]
-    said = {"entry": str(path), "mIoU": result["mIoU"], "mCA": result["mCA"]}
-    text = f"{path}: mIoU {percent(result['mIoU'])}, mCA {percent(result['mCA'])}"
-    typer.echo(json.dumps(said, indent=1) if as_json else text)
+    typer.echo(_say_added(path, entry, as_json=as_json))
+
+
+def _say_added(path: Path, entry: Mapping[str, Any], *, as_json: bool) -> str:
+    from semantic2d_dataset.scoring.metrics import percent
+
+    means, std = {mean: entry["result"][mean] for mean in ("mIoU", "mCA")}, {}
+    count = len(entry["seeds"]["runs"]) if "seeds" in entry else 1
+    if count > 1:
+        spreads = {mean: entry["seeds"]["spread"][mean] or {} for mean in means}
+        std = {mean: spread.get("std") for mean, spread in spreads.items()}
+        means = {mean: spread.get("mean") for mean, spread in spreads.items()}
+    if as_json:
+        more = {"seeds": count, "std": std} if std else {}
+        return json.dumps({"entry": str(path), **means, **more}, indent=1)
+    figures = ", ".join(
+        f"{mean} {percent(figure)}" + (f" ± {percent(std[mean])}" if std else "")
+        for mean, figure in means.items()
+    )
+    return f"{path}: {figures}" + (f" over {count} seeds" if std else "")
 
 
 @app.command()
@@ -88,7 +121,8 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Check every entry: digests, figures, and the score again where predictions are at hand."""
-    from leaderboard.checking import UNVERIFIED, WRONG, AtHand, check_entries, format_check
+    from leaderboard.at_hand import AtHand
+    from leaderboard.checking import UNVERIFIED, WRONG, check_entries, format_check
 
     found = check_entries(entries, AtHand(data or (), _folder(predictions)))
     if as_json:
@@ -125,10 +159,12 @@ def fetch(
 
     to.mkdir(parents=True, exist_ok=True)
     for path in list_entries(entries):
-        file = fetch_predictions(
-            read_entry(path), to, most_bytes=most_mb * 1_000_000, hosts=host or ()
-        )
-        typer.echo(f"{path.name}: {file or 'points to no predictions'}")
+        found = [
+            fetch_predictions(each, to, most_bytes=most_mb * 1_000_000, hosts=host or ())
+            for each in read_entry(path).files()
+        ]
+        for file in found or [None]:
+            typer.echo(f"{path.name}: {file or 'points to no predictions'}")
 
 
 @app.command()
@@ -140,7 +176,7 @@ def build(
     predictions: _Predictions = None,
 ) -> None:
     """Write the pages of the board: a folder that any web server can show, or none."""
-    from leaderboard.checking import AtHand
+    from leaderboard.at_hand import AtHand
     from leaderboard.site import build_site
 
     count = build_site(out, entries, AtHand(data or (), _folder(predictions)))

@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -33,7 +33,9 @@ SCORED, SANITY, PUBLISHED = "scored", "sanity", "published"
 
 _MAX_BYTES = 1 << 24
 _NUMBERS = re.compile(r"\[\n(?:\s*-?[0-9][0-9.e+-]*,?\n)+\s*\]")  # no text holds a line break
-_SEALED = ("track", "metadata", "digests", "taxonomy", "source", "figures", "result")
+_SEALED = dict.fromkeys(
+    ("track", "metadata", "digests", "taxonomy", "source", "figures", "result"), 1
+) | {"seeds": 3}  # how deep a part is sealed by its members: every digest has a seal of its own
 
 
 @dataclass(frozen=True, order=True)
@@ -52,6 +54,31 @@ class Track:
     evaluator_version: str = ""
     split_digest: str = ""
     taxonomy_digest: str = ""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A predictions file that an entry rests on.
+
+    Parameters
+    ----------
+    field
+        JSON path of its digest.
+    digest
+        Its SHA-256.
+    url
+        Where it is, or None.
+    seeds
+        What it says of the seeds of its training, None where it does not.
+    run
+        What the entry says of this training, None where there is one only.
+    """
+
+    field: str
+    digest: str
+    url: str | None
+    seeds: Any
+    run: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -81,8 +108,39 @@ class Entry:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the predictions, "" for what was only published."""
+        """SHA-256 of the predictions that are shown, "" for what was only published."""
         return str(self.said.get("digests", {}).get("predictions", ""))
+
+    @property
+    def runs(self) -> Sequence[Mapping[str, Any]]:
+        """What is said of every training; empty where there is one only."""
+        runs: Sequence[Mapping[str, Any]] = self.said.get("seeds", {}).get("runs", ())
+        return runs
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """The predictions files of all seeds; none for what was only published."""
+        if self.runs:
+            return tuple(
+                Source(
+                    f"seeds.runs[{i}].predictions",
+                    run["predictions"],
+                    run.get("url"),
+                    run.get("seeds"),
+                    run,
+                )
+                for i, run in enumerate(self.runs)
+            )
+        if self.kind == PUBLISHED:
+            return ()
+        seeds, url = self.said["metadata"].get("seeds"), self.said.get("predictions_url")
+        return (Source("digests.predictions", self.digest, url, seeds),)
+
+    def files(self) -> Iterator[Entry]:
+        """Yield an entry for each predictions file, which says where it is and no more."""
+        for source in self.sources:
+            said: dict[str, Any] = {"digests": {"predictions": source.digest}}
+            yield Entry(self.path, said | ({"predictions_url": source.url} if source.url else {}))
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -156,7 +214,8 @@ def seal(said: Mapping[str, Any]) -> dict[str, Any]:
 
 def seals_of(said: Mapping[str, Any]) -> dict[str, str]:
     """Return the checksum of every part by its JSON path: of members, where they are figures."""
-    return {path: _checksum(value) for path, value in sorted(_parts(said))}
+    parts = [part for name in said for part in _parts(said[name], name, _SEALED.get(name, 0))]
+    return {path: _checksum(value) for path, value in sorted(parts, key=lambda part: part[0])}
 
 
 def schema_problems(said: Any) -> list[tuple[str, str]]:
@@ -236,13 +295,15 @@ def to_json(said: Mapping[str, Any]) -> str:
     return _NUMBERS.sub(lambda rows: " ".join(rows[0].split()), text) + "\n"
 
 
-def _parts(said: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in said.items():
-        if name not in _SEALED or not isinstance(value, Mapping):
-            yield name, value
-            continue
-        for member, inner in value.items():
-            yield f"{name}.{member}", inner
+def _parts(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
+    if not depth or not isinstance(value, Mapping | list):
+        yield path, value
+    elif isinstance(value, Mapping):
+        for name, member in value.items():
+            yield from _parts(member, f"{path}.{name}", depth - 1)
+    else:
+        for i, member in enumerate(value):
+            yield from _parts(member, f"{path}[{i}]", depth - 1)
 
 
 def _checksum(value: Any) -> str:

@@ -34,18 +34,42 @@ def find_inconsistencies(said: Mapping[str, Any], taxonomy: Taxonomy) -> Iterato
     result = said["result"]
     if said["digests"]["taxonomy"] != taxonomy.digest:
         yield "digests.taxonomy", f"expected {taxonomy.digest}, the digest of the classes named"
-    yield from _recount("result", result, taxonomy)
+    yield from recount("result", result, taxonomy)
     lidars = sorted(result["per_lidar"])
     if lidars != sorted(said["track"]["lidars"]):
         yield "track.lidars", f"expected {', '.join(lidars)}, which the result is of"
     broken = False
     for lidar in lidars:
-        found = list(_recount(f"result.per_lidar.{lidar}", result["per_lidar"][lidar], taxonomy))
+        found = list(recount(f"result.per_lidar.{lidar}", result["per_lidar"][lidar], taxonomy))
         broken = broken or any(path.endswith(".confusion") for path, _ in found)
         yield from found
     if not broken:
         yield from _compare_sum(result, taxonomy)
     yield from _check_bands(result, taxonomy)
+
+
+def recount(path: str, scores: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[Problem]:
+    """Yield every score that is not the one which its confusion matrix gives.
+
+    Parameters
+    ----------
+    path
+        JSON path of the scores.
+    scores
+        As `Evaluator.compute` returns them; they may hold more.
+    taxonomy
+        Their classes.
+    """
+    classes, rows = len(taxonomy), scores["confusion"]
+    if len(rows) != classes or any(len(row) != classes for row in rows):
+        yield f"{path}.confusion", f"expected {classes} rows of {classes} counts"
+        return
+    evaluator = Evaluator(taxonomy)
+    evaluator.confusion = np.array(rows, np.int64)
+    evaluator.ignored = scores["ignored"]
+    expected = evaluator.compute()
+    found = {name: scores[name] for name in expected if name in scores}
+    yield from differences(expected, found, path)
 
 
 def differences(expected: Any, found: Any, path: str) -> Iterator[Problem]:
@@ -64,20 +88,6 @@ def differences(expected: Any, found: Any, path: str) -> Iterator[Problem]:
             yield from differences(one, other, f"{path}[{i}]")
     elif not _same(expected, found):
         yield path, f"expected {_short(expected)}, found {_short(found)}"
-
-
-def _recount(path: str, scores: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[Problem]:
-    """Compare scores with those that their confusion matrix gives."""
-    classes, rows = len(taxonomy), scores["confusion"]
-    if len(rows) != classes or any(len(row) != classes for row in rows):
-        yield f"{path}.confusion", f"expected {classes} rows of {classes} counts"
-        return
-    evaluator = Evaluator(taxonomy)
-    evaluator.confusion = np.array(rows, np.int64)
-    evaluator.ignored = scores["ignored"]
-    expected = evaluator.compute()
-    found = {name: scores[name] for name in expected if name in scores}
-    yield from differences(expected, found, path)
 
 
 def _compare_sum(result: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[Problem]:

@@ -16,7 +16,8 @@ from markupsafe import Markup
 from tqdm import tqdm
 
 from leaderboard import charts
-from leaderboard.checking import VERIFIED, WRONG, AtHand, Checked, check_entries, format_check
+from leaderboard.at_hand import AtHand
+from leaderboard.checking import VERIFIED, WRONG, Checked, check_entries, format_check
 from leaderboard.entries import PUBLISHED
 from leaderboard.rows import (
     METRICS,

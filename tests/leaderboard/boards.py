@@ -1,16 +1,21 @@
 """Predictions and entries for tests, made from a small data set."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from leaderboard.adding import add_entry, make_entry
-from leaderboard.entries import seal
+from leaderboard.adding import add_entry, make_entry, make_entry_of_seeds
+from leaderboard.at_hand import AtHand
+from leaderboard.checking import WRONG, check_entry
+from leaderboard.entries import seal, to_json
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.scoring.predictions import PredictionsWriter
+
+DERIVED = ("conditions", "intervals", "calibration", "samples")
+"""Parts of a result that do not follow from its confusion matrix."""
 
 
 def write_predictions(path: Path, folder: Path, *, right=0.5, seed=0, **metadata) -> Path:
@@ -39,6 +44,11 @@ def write_predictions(path: Path, folder: Path, *, right=0.5, seed=0, **metadata
 
 def add(predictions: Path, folder: Path, entries: Path, **options) -> Path:
     return add_entry(make_entry(predictions, open_dataset(folder), **options), entries)
+
+
+def add_seeds(predictions: Iterable[Path], folder: Path, entries: Path, **options) -> Path:
+    entry = make_entry_of_seeds(list(predictions), open_dataset(folder), **options)
+    return add_entry(entry, entries)
 
 
 def leaves_of(value: Any, path: tuple = ()) -> Iterator[tuple]:
@@ -73,6 +83,17 @@ def edited(said: dict, path: tuple) -> dict:
 def json_path(path: tuple) -> str:
     parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
     return "".join(parts).removeprefix(".")
+
+
+def assert_every_edit_is_named(path: Path, said: dict, leaves: Iterable[tuple]) -> None:
+    """Edit one value after another, and let the entry alone be checked."""
+    for leaf in leaves:
+        path.write_text(to_json(edited(said, leaf)))
+        found = check_entry(path, AtHand())
+        assert found.status == WRONG, leaf
+        where = leaf[1] if leaf[0] == "seals" else json_path(leaf)
+        named = [name for name, _ in found.problems]
+        assert any(where.startswith(name) or name == "the file" for name in named), (leaf, named)
 
 
 def with_extras(said: dict) -> dict:

@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 
@@ -67,6 +68,36 @@ def test_the_way_from_predictions_to_pages(tmp_path, dataset_folder, predictions
     assert "fair.json: verified" in checked.stdout
     assert run("build", site, *options, *at_hand).exit_code == 0
     assert (site / "index.html").is_file()
+
+
+def test_seeds_are_added_and_verified_together(tmp_path, dataset_folder, seeds_folder):
+    entries, paths = tmp_path / "entries", sorted(seeds_folder.iterdir())
+    entries.mkdir()
+    options = ("--data", dataset_folder, "--entries", entries)
+    urls = [word for path in paths for word in ("--url", f"https://host/{path.name}")]
+    added = run("add", *paths, *urls, *options)
+    assert re.search(r"mIoU \d+\.\d\d ± \d\.\d\d, mCA .+ over 3 seeds", added.stdout), added
+    again = json.loads(run("add", *reversed(paths), *options, "--force", "--json").stdout)
+    assert again["seeds"] == 3
+    assert again["std"]["mIoU"] > 0
+    at_hand = ("--predictions", seeds_folder, "--strict")
+    checked = run("check", "--data", dataset_folder, "--entries", entries, *at_hand)
+    assert checked.exit_code == 0
+    assert checked.stdout.endswith("net.json: verified\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--url", "https://host/0.h5"), "3 predictions and 1 addresses: give one --url for each"),
+        (("--sanity",), "a sanity row has no seeds"),
+    ],
+)
+def test_seeds_with_wrong_options_are_wrong_usage(tmp_path, seeds_folder, words, message):
+    found = run("add", *sorted(seeds_folder.iterdir()), "--entries", tmp_path, *words)
+    assert found.exit_code == 2
+    assert message in " ".join(re.sub("[│\n]", " ", found.output).split())
+    assert not list(tmp_path.iterdir())
 
 
 def test_check_fails_on_wrong_entries_and_on_unverified_ones_where_asked(board):

@@ -1,3 +1,4 @@
+import copy
 import hashlib
 from pathlib import Path
 
@@ -5,6 +6,7 @@ import pytest
 
 from leaderboard.entries import Entry
 from leaderboard.fetching import fetch_predictions
+from leaderboard.published import published_entries
 from semantic2d_dataset.errors import ChecksumError, DownloadError, InvalidInputError
 from tests.access.hosts import Host, make_bytes
 
@@ -82,3 +84,20 @@ def test_another_file_under_the_name_of_a_digest_is_not_taken_for_it(host, tmp_p
 def test_an_entry_that_points_nowhere_gets_nothing(tmp_path):
     entry = Entry(Path("x.json"), {"digests": {"predictions": "0" * 64}})
     assert fetch_predictions(entry, tmp_path, most_bytes=1) is None
+
+
+def test_predictions_of_every_seed_that_has_an_address_are_got(tmp_path, entry_of_seeds):
+    said = copy.deepcopy(entry_of_seeds)
+    bodies = [make_bytes(1000, seed) for seed in range(2)]
+    host = Host({f"{n}.h5": body for n, body in enumerate(bodies)})
+    for n, (run, body) in enumerate(zip(said["seeds"]["runs"], bodies, strict=False)):
+        run["predictions"] = hashlib.sha256(body).hexdigest()
+        run["url"] = f"{host.url}/records/7/files/{n}.h5"
+    entry = Entry(Path("x.json"), said)
+    found = [fetch_predictions(each, tmp_path, most_bytes=1000) for each in entry.files()]
+    host.close()
+    assert [path and path.read_bytes() for path in found] == [*bodies, None]
+
+
+def test_a_published_row_has_no_predictions_to_get(tmp_path):
+    assert list(Entry(Path("x.json"), next(published_entries())).files()) == []
