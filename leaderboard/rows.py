@@ -9,6 +9,7 @@ from typing import Any
 from leaderboard.checking import Checked
 from leaderboard.entries import PUBLISHED, SANITY, SCORED, Entry, Track, features_of
 from leaderboard.published import doubtful_means
+from leaderboard.seeds import names_of_runs
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
 from semantic2d_dataset.scoring.published import ALL
@@ -28,7 +29,7 @@ class Figure:
     low, high
         Limits of its confidence interval, or None.
     std
-        Standard deviation over samples of the model, or None.
+        Standard deviation over seeds or samples of the model, or None.
     """
 
     value: float | None
@@ -36,14 +37,49 @@ class Figure:
     high: float | None = None
     std: float | None = None
 
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """What a whisker spans: the interval, or else one standard deviation to both sides."""
+        if self.low is not None and self.high is not None:
+            return self.low, self.high
+        if self.value is None or self.std is None:
+            return None
+        return max(0.0, self.value - self.std), min(1.0, self.value + self.std)
+
 
 @dataclass(frozen=True)
 class Scores:
-    """Figures of an entry on one lidar: means, and by metric and class."""
+    """Figures of an entry on one lidar: means, and by metric and class.
+
+    Parameters
+    ----------
+    mIoU, mCA
+        The means.
+    classes
+        By metric and name of the class.
+    over
+        What standard deviations are over, in words; empty where there are none.
+    """
 
     mIoU: Figure
     mCA: Figure
     classes: Mapping[str, Mapping[str, Figure]]
+    over: str = ""
+
+    def figure(self, metric: str, name: str | None = None) -> Figure:
+        """Return the figure of a class, or the mean of the metric where none is named."""
+        if name is not None:
+            return self.classes[metric][name]
+        return self.mIoU if metric == "iou" else self.mCA
+
+
+@dataclass(frozen=True)
+class Run:
+    """One of several trainings: its name, what the entry says of it, and whether it is shown."""
+
+    name: str
+    said: Mapping[str, Any]
+    shown: bool
 
 
 @dataclass(frozen=True)
@@ -63,7 +99,8 @@ class Row:
     def badges(self) -> tuple[str, ...]:
         """What to say of the row beside its name."""
         kind = ("sanity",) if self.entry.kind == SANITY else ()
-        return (*kind, self.checked.status)
+        seeds = (self.scores.over,) if self.entry.runs else ()
+        return (*kind, *seeds, self.checked.status)
 
     @property
     def page(self) -> str:
@@ -86,11 +123,10 @@ class TrackTable:
         """Names of the classes that enter a mean."""
         return tuple(self.taxonomy.names[c] for c in self.taxonomy.scored_ids)
 
-    def best(self, metric: str, name: str) -> float | None:
-        """Return the best figure of the ranked rows in a column."""
-        figures = [
-            _figure(row.scores, metric, name).value for row in self.rows if row.place is not None
-        ]
+    def best(self, metric: str, name: str | None = None) -> float | None:
+        """Return the best figure of the ranked rows: of a class, or the mean if none is named."""
+        ranked = [row.scores for row in self.rows if row.place is not None]
+        figures = [scores.figure(metric, name).value for scores in ranked]
         return max((figure for figure in figures if figure is not None), default=None)
 
 
@@ -132,9 +168,16 @@ def make_tables(checked: Iterable[Checked]) -> list[TrackTable]:
 
 
 def scores_of(entry: Entry, lidar: str) -> Scores:
-    """Return what an entry scores on a lidar."""
+    """Return what an entry scores on a lidar; of several seeds, their means."""
     if entry.kind == PUBLISHED:
         return _published_scores(entry.said["figures"])
+    if entry.runs:
+        return _mean_scores(entry.said["seeds"]["spread"]["per_lidar"][lidar])
+    return shown_scores(entry, lidar)
+
+
+def shown_scores(entry: Entry, lidar: str) -> Scores:
+    """Return what the predictions score that are shown in full: of several seeds, of one."""
     result = entry.said["result"]
     scores = result["per_lidar"][lidar]
     # intervals are those of all lidars together
@@ -152,6 +195,15 @@ def scores_of(entry: Entry, lidar: str) -> Scores:
             "ca": {name: Figure(scores[name]["ca"]) for name in entry.taxonomy.names},
         },
     )
+
+
+def runs_of(entry: Entry) -> list[Run]:
+    """Return the trainings of an entry; none where there is one only."""
+    names = names_of_runs(entry.runs)
+    return [
+        Run(name, run, run["predictions"] == entry.digest)
+        for name, run in zip(names, entry.runs, strict=True)
+    ]
 
 
 def doubts(entry: Entry) -> list[str]:
@@ -181,7 +233,7 @@ def facts_of(entry: Entry) -> list[tuple[str, str]]:
         "Scans per second": metadata.get("scans_per_second"),
         "Measured": metadata.get("scans_per_second_measured"),
         "Hardware": metadata.get("hardware"),
-        "Seeds": _joined(metadata.get("seeds")),
+        "Seeds": None if entry.runs else _joined(metadata.get("seeds")),  # listed by themselves
     }
     return [(name, str(value)) for name, value in said.items() if value not in (None, "")]
 
@@ -219,13 +271,18 @@ def _published_scores(figures: Mapping[str, Mapping[str, Any]]) -> Scores:
         metric: {name: read(TITLES[metric], name) for name in SEMANTIC2D.names}
         for metric in METRICS
     }
-    return Scores(read("IoU", ALL), read("CA", ALL), classes)
+    return Scores(read("IoU", ALL), read("CA", ALL), classes, over="samples")
 
 
-def _figure(scores: Scores, metric: str, name: str) -> Figure:
-    if name == "Mean":
-        return scores.mIoU if metric == "iou" else scores.mCA
-    return scores.classes[metric][name]
+def _mean_scores(said: Mapping[str, Any]) -> Scores:
+    def read(spread: Mapping[str, float] | None) -> Figure:
+        return Figure(None) if spread is None else Figure(spread["mean"], std=spread["std"])
+
+    classes = {
+        metric: {name: read(of[metric]) for name, of in said["classes"].items()}
+        for metric in METRICS
+    }
+    return Scores(read(said["mIoU"]), read(said["mCA"]), classes, over=f"{said['count']} seeds")
 
 
 def _with_limits(value: float | None, limits: Any) -> Figure:

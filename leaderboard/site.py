@@ -27,7 +27,9 @@ from leaderboard.rows import (
     facts_of,
     make_tables,
     page_of,
+    runs_of,
     scores_of,
+    shown_scores,
 )
 from leaderboard.samples import draw_samples
 from semantic2d_dataset.errors import InvalidInputError
@@ -123,6 +125,7 @@ def _method(checked: Checked) -> dict[str, Any]:
         {
             "lidar": track.lidar,
             "scores": scores_of(entry, track.lidar),
+            "shown": shown_scores(entry, track.lidar) if entry.runs else None,
             "said": result.get("per_lidar", {}).get(track.lidar),
             "bars": charts.class_bars(scores_of(entry, track.lidar), names),
             "samples": _samples(checked, track.lidar),
@@ -134,6 +137,7 @@ def _method(checked: Checked) -> dict[str, Any]:
         "entry": entry,
         "facts": facts_of(entry),
         "doubts": doubts(entry),
+        "runs": runs_of(entry),
         "taxonomy": taxonomy,
         "lidars": lidars,
         "result": result,

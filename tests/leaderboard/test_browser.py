@@ -13,7 +13,7 @@ import threading
 import pytest
 
 from leaderboard.adding import add_entry
-from leaderboard.checking import AtHand
+from leaderboard.at_hand import AtHand
 from leaderboard.entries import to_json
 from leaderboard.published import published_entries
 from leaderboard.site import build_site
@@ -22,7 +22,7 @@ from tests.leaderboard.boards import add, with_extras
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory, dataset_folder, predictions_folder):
+def site(tmp_path_factory, dataset_folder, predictions_folder, entry_of_seeds):
     """Pages with every kind of row."""
     folder = tmp_path_factory.mktemp("site")
     entries = folder / "entries"
@@ -33,7 +33,7 @@ def site(tmp_path_factory, dataset_folder, predictions_folder):
     poor.write_text(to_json(with_extras(json.loads(poor.read_text()))))
     shutil.copytree(predictions_folder, folder / "predictions")
     (folder / "predictions" / "poor.h5").unlink()  # what was added is not scored again
-    for entry in published_entries():
+    for entry in (entry_of_seeds, *published_entries()):
         add_entry(entry, entries)
     build_site(folder / "pages", entries, AtHand([str(dataset_folder)], folder / "predictions"))
     return folder / "pages"
@@ -80,29 +80,31 @@ def names_of(page):
 
 def test_columns_sort_by_mouse_and_by_keyboard(browser, address):
     with opened(browser, address) as page:
-        assert names_of(page) == ["Good", "Fair", "Poor"]
+        assert names_of(page) == ["Good", "Net", "Fair", "Poor"]
         header = page.locator("section.track:visible thead th", has_text="mIoU")
         assert header.get_attribute("aria-sort") == "descending"
         header.get_by_role("button").click()
         assert header.get_attribute("aria-sort") == "ascending"
-        assert names_of(page) == ["Poor", "Fair", "Good"]
+        assert names_of(page) == ["Poor", "Fair", "Net", "Good"]
         method = page.locator("section.track:visible thead th", has_text="Method")
         method.get_by_role("button").focus()
         page.keyboard.press("Enter")
-        assert names_of(page) == ["Fair", "Good", "Poor"]
+        assert names_of(page) == ["Fair", "Good", "Net", "Poor"]
         assert header.get_attribute("aria-sort") is None
         page.locator("section.track:visible thead th", has_text="Rank").locator("button").click()
-        assert names_of(page) == ["Fair", "Poor", "Good"]  # what has no rank comes last
+        assert names_of(page) == ["Net", "Fair", "Poor", "Good"]  # what has no rank comes last
 
 
 def test_rows_are_filtered_by_words_and_by_rank(browser, address):
     with opened(browser, address) as page:
         page.get_by_label("Filter").fill("unverified")
-        assert names_of(page) == ["Poor"]
-        assert page.get_by_role("status").inner_text() == "1 of 3 rows"
+        assert names_of(page) == ["Net", "Poor"]
+        assert page.get_by_role("status").inner_text() == "2 of 4 rows"
+        page.get_by_label("Filter").fill("3 seeds")
+        assert names_of(page) == ["Net"]
         page.get_by_label("Filter").fill("")
         page.get_by_label("Ranked rows only").check()
-        assert names_of(page) == ["Fair", "Poor"]
+        assert names_of(page) == ["Net", "Fair", "Poor"]
 
 
 def test_figures_by_class_change_with_the_choice(browser, address):
@@ -153,7 +155,7 @@ def test_everything_can_be_read_and_has_a_name(browser, address, site, width, sc
 
 def test_without_script_every_table_is_there(browser, address):
     with opened(browser, address, java_script_enabled=False) as page:
-        assert len(names_of(page)) == 20
+        assert len(names_of(page)) == 21
         assert not page.get_by_label("Filter").is_visible()
         page.get_by_role("link", name="as published, test of frame").first.click()
         assert "#" in page.url

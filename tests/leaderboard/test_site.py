@@ -6,9 +6,11 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from leaderboard.adding import add_entry
-from leaderboard.checking import AtHand
+from leaderboard.at_hand import AtHand
+from leaderboard.checking import check_entries
 from leaderboard.entries import file_name, seal, to_json
 from leaderboard.published import published_entries
+from leaderboard.rows import make_tables
 from leaderboard.site import build_site
 from semantic2d_dataset.errors import InvalidInputError
 from tests.leaderboard.boards import edited, with_extras
@@ -198,3 +200,73 @@ def test_several_lidars_are_tracks_of_their_own(tmp_path):
     build_site(tmp_path / "site", tmp_path / "entries", at_hand)
     start = (tmp_path / "site" / "index.html").read_text()
     assert start.count('<section class="track"') == 2
+
+
+@pytest.fixture
+def seeds_beside_others(board, entry_of_seeds):
+    """Three methods of one training each, and one of three seeds."""
+    add_entry(entry_of_seeds, board)
+    return board
+
+
+def test_seeds_are_one_row_at_their_mean_with_its_deviation(
+    seeds_beside_others, entry_of_seeds, tmp_path
+):
+    build_site(tmp_path / "site", seeds_beside_others, AtHand())
+    start = (tmp_path / "site" / "index.html").read_text()
+    spread = entry_of_seeds["seeds"]["spread"]
+    mean, std = (f"{100 * spread['mIoU'][name]:.2f}" for name in ("mean", "std"))
+    (row,) = (part for part in start.split("<tr")[1:] if ">Net</a>" in part)
+    assert f'data-value="{spread["mIoU"]["mean"]}"' in row
+    assert f'{mean} <span class="std">± {std}</span>' in row
+    assert '<span class="badge">3 seeds</span>' in row.replace(
+        'class="badge 3-seeds"', 'class="badge"'
+    )
+    chair = spread["classes"]["Chair"]["ca"]
+    assert f'{100 * chair["mean"]:.1f} <span class="std">± {100 * chair["std"]:.1f}</span>' in row
+
+
+def test_a_rank_is_that_of_the_mean_and_not_of_the_seed_that_is_shown(board, entry_of_seeds):
+    """Another method stands between the two."""
+    add_entry(entry_of_seeds, board)
+    (table,) = make_tables(check_entries(board, AtHand()))
+    (row,) = (row for row in table.rows if row.entry.runs)
+    assert row.scores.mIoU.value == entry_of_seeds["seeds"]["spread"]["mIoU"]["mean"]
+    assert row.scores.mIoU.value != entry_of_seeds["result"]["mIoU"]
+    values = [row.scores.mIoU.value for row in table.rows]
+    assert values == sorted(values, reverse=True)
+    assert table.best("iou") == values[0]
+    assert table.best("iou", "Chair") == max(
+        r.scores.classes["iou"]["Chair"].value for r in table.rows
+    )
+
+
+def test_the_page_of_seeds_says_which_one_is_shown_and_lists_all(
+    seeds_beside_others, entry_of_seeds, tmp_path
+):
+    build_site(tmp_path / "site", seeds_beside_others, AtHand())
+    page = next(p for name, p in pages_of(tmp_path / "site").items() if "--net." in name)
+    assert "those of <b>seed 0</b>, which has the median mIoU" in page
+    assert "over 3 seeds" in page
+    for n, run in enumerate(entry_of_seeds["seeds"]["runs"]):
+        assert (
+            f"<dt>SHA-256 of the predictions, seed {n}</dt><dd><code>{run['predictions']}" in page
+        )
+        assert f"<td>{100 * run['per_lidar']['small']['mIoU']:.2f}</td>" in page
+    counts = entry_of_seeds["result"]["per_lidar"]["small"]["confusion"]
+    assert f'title="{counts[1][1]:,} points"' in page
+
+
+def test_pages_of_one_training_say_nothing_of_seeds(board, tmp_path):
+    build_site(tmp_path / "site", board, AtHand())
+    for name, page in pages_of(tmp_path / "site").items():
+        assert "By seed" not in page, name
+        assert "seeds</span>" not in page, name
+
+
+def test_scans_of_the_seed_that_is_shown_are_drawn(
+    board_of_seeds, dataset_folder, seeds_folder, tmp_path
+):
+    build_site(tmp_path / "site", board_of_seeds, AtHand([str(dataset_folder)], seeds_folder))
+    page = next(p for name, p in pages_of(tmp_path / "site").items() if "--net." in name)
+    assert page.count('aria-label="Prediction of ') == 4
