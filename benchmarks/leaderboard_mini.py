@@ -2,8 +2,9 @@
 
 Run with ``python benchmarks/leaderboard_mini.py --runs RUNS --out FOLDER``. RUNS holds folders that
 training left, named ``<model>-<features>-<lidar>-seed<n>`` as ``semantic2d baseline reproduce``
-names them; of each, seed 0 is shown. FOLDER gets ``predictions/`` and ``site/``; entries go to
-``--entries``. What is there already is kept, so that it can be run again; delete it after a change.
+names them; those that differ in their seed only are one entry. FOLDER gets ``predictions/`` and
+``site/``; entries go to ``--entries``. What is there already is kept, so that it can be run again;
+delete it after a change.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import os
 import subprocess
 import sys
+from itertools import groupby
 from pathlib import Path
 
 DETECTORS = ("lines", "legs")
@@ -25,7 +27,7 @@ def semantic2d(*words: object) -> None:
 
 def predict(runs: Path, folder: Path, scheme: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    models = sorted(run for run in runs.glob("*-seed0") if (run / "model.json").exists())
+    models = sorted(run for run in runs.glob("*-seed*") if (run / "model.json").exists())
     for kind in SANITY:
         if not (folder / f"{kind}.h5").exists():
             out = folder / f"{kind}.h5"
@@ -35,6 +37,10 @@ def predict(runs: Path, folder: Path, scheme: str) -> None:
         if not out.exists():
             more = () if run in DETECTORS else ("--probabilities",)
             semantic2d("baseline", "predict", run, "--out", out, "--scheme", scheme, *more)
+
+
+def without_seed(path: Path) -> str:
+    return path.stem.rpartition("-seed")[0] or path.stem
 
 
 def main() -> None:
@@ -48,9 +54,10 @@ def main() -> None:
     predict(said.runs, predictions, said.scheme)
     said.entries.mkdir(parents=True, exist_ok=True)
     semantic2d("leaderboard", "published", "--entries", said.entries)
-    for path in sorted(predictions.glob("*.h5")):
-        more = ("--sanity",) if path.stem in SANITY else ()
-        semantic2d("leaderboard", "add", path, "--entries", said.entries, "--force", *more)
+    files = sorted(predictions.glob("*.h5"), key=without_seed)
+    for name, seeds in groupby(files, key=without_seed):
+        more = ("--sanity",) if name in SANITY else ()
+        semantic2d("leaderboard", "add", *seeds, "--entries", said.entries, "--force", *more)
     at_hand = ("--entries", said.entries, "--predictions", predictions)
     semantic2d("leaderboard", "check", "--strict", *at_hand)
     semantic2d("leaderboard", "build", said.out / "site", *at_hand)
