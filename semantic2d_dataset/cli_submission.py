@@ -241,7 +241,10 @@ def pack(
     from semantic2d_dataset.scoring import about as descriptions
 
     check_target(out, (predictions, about), force=force)
-    descriptions.pack(predictions, descriptions.read_about(about), out)
+    said = descriptions.read_about(about)
+    descriptions.pack(predictions, said, out)
+    for remark in descriptions.remarks_on(said):
+        typer.echo(f"note: {about}: {remark}", err=True)
     typer.echo(f"wrote {out}; check it with: semantic2d submission validate {out}")
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import resources
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,13 +19,14 @@ from semantic2d_dataset.errors import CorruptFileError, InvalidInputError, Unsaf
 from semantic2d_dataset.format.container import ContainerReader
 from semantic2d_dataset.format.schema import PREDICTIONS
 from semantic2d_dataset.format.writing import ContainerWriter, root_attributes
+from semantic2d_dataset.scene.documents import hint
 from semantic2d_dataset.scene.scans import check_array
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 
 MAX_SAMPLES = 1024
 _MAX_METADATA_BYTES = 1 << 16
 _MAX_BLOCK_BYTES, _MAX_CHUNK_BYTES = 1 << 26, 1 << 24
-_PROBLEMS, _MESSAGE = 50, 300  # of metadata: how many are listed, and how long each is
+_PROBLEMS, _PART = 50, 200  # of metadata: how many are listed, characters of names and values
 
 
 class PredictionsWriter:
@@ -261,23 +262,48 @@ class PredictionsReader:
 
 
 def metadata_problems(metadata: Any) -> list[str]:
-    """List what keeps metadata from fitting ``metadata.schema.json``."""
+    """List what keeps metadata from fitting ``metadata.schema.json``: where, and what is wrong."""
     found = jsonschema.Draft202012Validator(metadata_schema()).iter_errors(metadata)
-    return [
-        f"metadata{_cut(error.json_path.removeprefix('$'))}: {_in_words(error)}"
-        for error in islice(found, _PROBLEMS)
-    ]
+    problems = (
+        f"metadata{_cut(error.json_path.removeprefix('$'))}: {_what_is_wrong(error)}"
+        for error in found
+    )
+    return list(islice(chain(_not_json(metadata), problems), _PROBLEMS))
 
 
-def _in_words(error: jsonschema.ValidationError) -> str:
-    if error.validator != "pattern":
-        return _cut(error.message)
+def _not_json(metadata: Any) -> Iterator[str]:
+    """Find what YAML and Python have, a schema lets pass, and JSON cannot say."""
+    for name, value in metadata.items() if isinstance(metadata, dict) else ():
+        for key in (name, *(value if isinstance(value, dict) else ())):
+            if not isinstance(key, str):
+                yield f"metadata: expected text as the name of a field, found {_found(key)}"
+        if isinstance(value, float) and not math.isfinite(value):
+            yield f"metadata.{_cut(str(name))}: expected a finite number, found {value}"
+
+
+def _what_is_wrong(error: jsonschema.ValidationError) -> str:
+    """Say what was expected and found, as people put it; the schema's titles name its types."""
     schema: Any = error.schema
-    return f"{_cut(repr(error.instance))}: expected {schema['description']}"
+    instance: Any = error.instance
+    if error.validator == "required":
+        return f"{error.message}; add it"
+    if error.validator == "maxProperties":
+        return f"expected at most {error.validator_value} fields, found {len(instance)}"
+    if error.validator == "additionalProperties":
+        extra = [name for name in instance if name not in schema["properties"]]
+        return f"unknown field {_found(extra[0])}{hint(extra[0], schema['properties'])}"
+    advice = ""
+    if error.validator == "anyOf":  # a field that the schema does not know
+        advice = hint(error.absolute_path[-1], metadata_schema()["properties"])
+    return f"expected {schema['title']}, found {_found(instance)}{advice}"
+
+
+def _found(value: Any) -> str:
+    return "nothing" if value is None else _cut(repr(value))
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= _MESSAGE else f"{text[:_MESSAGE]} ..."
+    return text if len(text) <= _PART else f"{text[:_PART]} ..."
 
 
 def _path(sequence_id: str, part: str) -> str:

@@ -1,10 +1,12 @@
+import re
+
 import pytest
 import yaml
 
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
-from semantic2d_dataset.scoring.about import pack, read_about, write_template
+from semantic2d_dataset.scoring.about import pack, read_about, remarks_on, write_template
 from semantic2d_dataset.scoring.predictions import (
     PredictionsReader,
     PredictionsWriter,
@@ -52,11 +54,18 @@ def test_a_template_holds_what_the_predictions_say(predictions):
     }
 
 
-def test_a_template_with_every_comment_taken_away_is_valid(predictions):
+def test_a_template_whose_fields_all_lost_their_first_character_is_valid(predictions, tmp_path):
     lines = write_template(predictions).splitlines()
-    kept = [line.removeprefix("# ") for line in lines if ": " in line or line.endswith("track:")]
-    said = yaml.safe_load("\n".join(line for line in kept if not line.startswith("What the")))
+    filled = [re.sub(r"^#(?=\w|  )", "", line) for line in lines]  # not "# What ..."
+    said = yaml.safe_load("\n".join(filled))
     assert metadata_problems(said) == []
+    assert remarks_on(said) == []
+    (tmp_path / "about.yaml").write_text("\n".join(filled))
+    with pytest.raises(InvalidInputError) as caught:
+        read_about(tmp_path / "about.yaml")
+    for name in ("authors", "paper", "code", "hardware"):
+        number = next(n for n, line in enumerate(filled, 1) if line.startswith(f"{name}:"))
+        assert f"line {number}: {name}: still the example" in str(caught.value)
     assert set(said) >= {"authors", "paper", "code", "track", "hardware", "scans_per_second"}
     assert set(said["track"]) == {"features", "training_data", "other_data"}
 
@@ -79,9 +88,21 @@ def test_packing_changes_the_description_alone(predictions, dataset_folder, tmp_
     ("said", "message"),
     [
         ("paper: https://example.org", "'method' is a required property"),
-        ("method: x\npaper: ftp://example.org", "metadata.paper"),
-        ("- method", "metadata: "),
+        ("method: x\npaper: ftp://example.org", "line 2: paper: expected an address"),
+        ("- method", "expected fields and values that say what a method is, found ['method']"),
+        ("# method: x", "expected fields and values that say what a method is, found nothing"),
         ("method: [", "not a YAML file"),
+        ("method: x\nparameters: many", "line 2: parameters: expected a whole number"),
+        ("method: x\nautors: [a]", "line 2: autors: expected text, a number, true or false"),
+        ("method: x\nautors: [a]", "did you mean 'authors'?"),
+        ("method: x\ntrack:\n  feature: R", "line 2: track: unknown field 'feature'; did you mean"),
+        ("method: x\nauthors: [a, '']", "line 2: authors[1]: expected a name of 1 to 200"),
+        ("method: x\npaper: example.org", "expected an address such as https://example.org/paper"),
+        ("method: x\nseeds: [1]\nmethod: y", "method: given in lines 1, 3; keep one"),
+        ("method: x\n12: y", "expected text as the name of a field, found 12"),
+        ("method: x\ntrack: {12: y}", "expected text as the name of a field, found 12"),
+        ("method: x\nscans_per_second: .nan", "line 2: scans_per_second: expected a finite number"),
+        ("method: x\nhardware: .inf", "line 2: hardware: expected a finite number, found inf"),
     ],
 )
 def test_a_description_that_does_not_fit_is_refused(tmp_path, said, message):
@@ -89,6 +110,21 @@ def test_a_description_that_does_not_fit_is_refused(tmp_path, said, message):
     with pytest.raises(InvalidInputError, match=r"about\.yaml") as caught:
         read_about(tmp_path / "about.yaml")
     assert message in str(caught.value)
+
+
+def test_all_that_is_wrong_in_a_description_is_said_at_once(tmp_path):
+    (tmp_path / "about.yaml").write_text("method: x\nauthors: a\nseeds: 1\ncode: [b]\n")
+    with pytest.raises(InvalidInputError) as caught:
+        read_about(tmp_path / "about.yaml")
+    for line, name in enumerate(("authors", "seeds", "code"), 2):
+        assert f"\n  - line {line}: {name}: expected " in str(caught.value)
+
+
+def test_what_a_description_leaves_out_and_what_may_be_a_slip_is_remarked():
+    silent, slip = remarks_on({"method": "x", "features": "R", "hardwre": "y", "mood": "good"})
+    assert silent.startswith("does not say: authors, paper, code, parameters, hardware")
+    assert "features" not in silent
+    assert slip == "hardwre: a field of your own; did you mean 'hardware'?"
 
 
 @pytest.mark.parametrize("url", ["https://a.org", "http://a.org:80/x?y=1#z", "https://a.org/~x/"])

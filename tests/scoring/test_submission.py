@@ -225,7 +225,8 @@ def test_names_are_of_any_language_and_a_bad_one_is_told_in_words():
     assert metadata_problems({"method": "\u7f51 2", "authors": names}) == []
     (problem,) = metadata_problems({"method": "S3\u200b-Net"})
     assert problem == (
-        "metadata.method: 'S3\\u200b-Net': expected text without control or invisible characters"
+        "metadata.method: expected text in one line, without control or invisible characters, "
+        "found 'S3\\u200b-Net'"
     )
 
 
