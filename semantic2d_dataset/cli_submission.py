@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
-from semantic2d_dataset.errors import InvalidInputError
+from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError, WriteError
 
 if TYPE_CHECKING:
     from semantic2d_dataset.access.registry import OpenDataset
@@ -21,6 +21,7 @@ submission = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup
 Data = Annotated[str | None, typer.Option(help="Data set folder or name; else as the file says.")]
 SchemeName = Annotated[str | None, typer.Option(help="Split scheme; else as the file says.")]
 SplitName = Annotated[str | None, typer.Option(help="Split; else as the file says.")]
+_KINDS = "range-noise, dropout, dimming, coarse, short-range or rain; all if not given."
 Force = Annotated[bool, typer.Option("--force", help="Replace what exists.")]
 
 
@@ -151,6 +152,7 @@ def compare(
         from semantic2d_dataset.plotting import check_picture_name
 
         check_picture_name(out)
+        _check_out(out, a, b)
     with open_executor(jobs=jobs) as executor:
         found = compare_predictions(a, b, _open_for(a, data), executor=executor)
     if out is not None:
@@ -167,7 +169,7 @@ def corrupt(
     dataset: Annotated[str, typer.Argument(help="Labelled data set, folder or name.")],
     out: Annotated[Path, typer.Argument(help="Folder that gets a data set KIND-SEVERITY each.")],
     *,
-    kind: Annotated[list[str] | None, typer.Option(help="Corruption; all if not given.")] = None,
+    kind: Annotated[list[str] | None, typer.Option(help=_KINDS)] = None,
     severity: Annotated[
         list[int] | None, typer.Option(min=1, max=5, help="1 to 5; all if not given.")
     ] = None,
@@ -190,11 +192,14 @@ def corrupt(
     for each in chosen:
         corruption.corruption(*each)
     data = open_dataset(dataset)
-    out.mkdir(exist_ok=True)
+    _check_folder(out)
     make = partial(corruption.corrupt_into, data, out, seed=seed, scheme=scheme, split=split)
-    with open_executor(jobs=jobs) as executor:
-        for folder in executor.map(make, chosen):
-            typer.echo(folder)
+    try:
+        with open_executor(jobs=jobs) as executor:
+            for folder in executor.map(make, chosen):
+                typer.echo(folder)
+    finally:  # processes that were ended had no time to
+        corruption.remove_partials(out, chosen, seed)
 
 
 def robustness(
@@ -253,6 +258,8 @@ def validate(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="Predictions file.")],
     *,
     data: Data = None,
+    scheme: SchemeName = None,
+    split: SplitName = None,
     jobs: Jobs = 1,
     as_json: AsJson = False,
 ) -> None:
@@ -261,7 +268,9 @@ def validate(
     from semantic2d_dataset.scoring import validation
 
     with open_executor(jobs=jobs) as executor:
-        problems = validation.validate(path, _open_for(path, data), executor=executor)
+        problems = validation.validate(
+            path, _open_for(path, data), scheme=scheme, split=split, executor=executor
+        )
     if as_json:
         typer.echo(json.dumps({"problems": problems}, indent=1))
     else:
@@ -325,14 +334,27 @@ def _open_for(predictions: Path, data: str | None) -> OpenDataset:
         raise InvalidInputError(
             f"{predictions}: names the data set {name!r}, which is a path; say it with --data"
         )
-    return open_dataset(name)
+    try:
+        return open_dataset(name)
+    except DatasetNotFoundError as err:
+        if data is not None:
+            raise
+        raise DatasetNotFoundError(
+            f"{err}\n{predictions} names it; if you have it in a folder, add --data FOLDER"
+        ) from err
 
 
 def _check_out(out: Path | None, *sources: Path) -> None:
-    """Refuse, before any work, an output that would replace an input or is a folder."""
-    if out is None:
-        return
-    if out.is_dir():
-        raise InvalidInputError(f"{out}: is a folder; give the name of a file")
-    if out.exists() and any(source.exists() and out.samefile(source) for source in sources):
-        raise InvalidInputError(f"{out}: is the input itself; choose another name")
+    """Refuse, before any work, an output that cannot be written or would replace an input."""
+    from semantic2d_dataset.format.writing import check_target
+
+    if out is not None:
+        check_target(out, sources, force=True)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse, before any work, a folder that cannot be made or used."""
+    if folder.exists() and not folder.is_dir():
+        raise InvalidInputError(f"{folder}: is a file; give the name of a folder")
+    if not folder.absolute().parent.is_dir():
+        raise WriteError(f"{folder}: the folder {folder.absolute().parent} does not exist")

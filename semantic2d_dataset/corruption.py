@@ -19,7 +19,8 @@ which data set, kind and severity, its version that of this generator.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -28,14 +29,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic2d_dataset.access.registry import OpenDataset
+from semantic2d_dataset.access.registry import OpenDataset, open_dataset
 from semantic2d_dataset.access.scan_source import Fields
 from semantic2d_dataset.access.transforms import BeamDropout, RangeNoise, Transform
 from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError
-from semantic2d_dataset.format.manifest import publish, read_manifest
+from semantic2d_dataset.format.manifest import publish
 from semantic2d_dataset.format.sequence import SequenceReader, SequenceWriter
 from semantic2d_dataset.format.splits import SplitScheme, split_id
-from semantic2d_dataset.format.writing import make_folder
+from semantic2d_dataset.format.writing import make_folder, stale_partials
 from semantic2d_dataset.scene.lidars import LidarSpec
 
 GENERATOR_VERSION = "1.0.0"
@@ -201,19 +202,11 @@ def corrupt_dataset(
         raise InvalidInputError(f"seed: expected 0 or more, found {seed}")
     if folder.exists():
         raise InvalidInputError(f"{folder}: exists already; choose a new folder")
-    chosen = data.scheme(scheme)
-    found = {
-        entry.id: chosen.scans_of(entry.id, split)
-        for entry in data.manifest.sequences
-        if entry.id in chosen.membership
-    }
-    scans = {name: indices for name, indices in found.items() if indices.size}
-    if not scans:
-        raise DatasetNotFoundError(f"{data.manifest.name}: no scan in split {split!r} of {scheme}")
-    manifest = data.manifest
+    scans, manifest = _scans_of(data, scheme, split), data.manifest
     name = f"{manifest.name}-{manifest.version}-{set_name(kind, severity, seed)}"
-    members = {i: np.full(len(n), split_id(split), np.uint8) for i, n in scans.items()}
-    made = SplitScheme(scheme, members, f"{split} of {manifest.name} {manifest.version}, {kind}")
+    made = SplitScheme(
+        scheme, _members(scans, split), f"{split} of {manifest.name} {manifest.version}, {kind}"
+    )
 
     def make(target: Path) -> None:
         (target / "sequences").mkdir()
@@ -238,24 +231,66 @@ def corrupt_into(
 ) -> Path:
     """Write the corrupted data set of a kind and severity below `out`, as `set_name` calls it.
 
-    One that is there already is kept. Other parameters and errors are those of
-    `corrupt_dataset`.
+    One that is there already is kept; one of other scans is refused. Other parameters and errors
+    are those of `corrupt_dataset`.
     """
     kind, severity = item
-    name = set_name(kind, severity, seed)
-    folder = out / name
-    if folder.exists():
-        found, base = read_manifest(folder), data.manifest
-        wanted = (f"{base.name}-{base.version}-{name}", GENERATOR_VERSION, {scheme})
-        if (found.name, found.version, {*found.splits}) == wanted:
-            return folder
-    corrupt_dataset(data, folder, kind, severity, seed=seed, scheme=scheme, split=split)
+    folder = out / set_name(kind, severity, seed)
+    if not folder.exists():
+        corrupt_dataset(data, folder, kind, severity, seed=seed, scheme=scheme, split=split)
+        return folder
+    base, members = data.manifest, _members(_scans_of(data, scheme, split), split)
+    wanted = f"{base.name}-{base.version}-{folder.name}"
+    if not _holds(folder, wanted, scheme, members):
+        raise InvalidInputError(
+            f"{folder}: exists already, and is not {wanted} {GENERATOR_VERSION} with {split} of "
+            f"{scheme}; choose another folder"
+        )
     return folder
+
+
+def remove_partials(out: Path, items: Iterable[tuple[str, int]], seed: int = 0) -> None:
+    """Remove what processes left half written below `out` that are gone."""
+    for kind, severity in items:
+        for stale in stale_partials(out.resolve() / set_name(kind, severity, seed)):
+            shutil.rmtree(stale, ignore_errors=True)
 
 
 def set_name(kind: str, severity: int, seed: int = 0) -> str:
     """Return the end of a corrupted data set's name."""
     return f"{kind}-{severity}" + (f"-seed{seed}" if seed else "")
+
+
+def _scans_of(data: OpenDataset, scheme: str, split: str) -> dict[str, NDArray[np.int64]]:
+    chosen = data.scheme(scheme)
+    found = {
+        entry.id: chosen.scans_of(entry.id, split)
+        for entry in data.manifest.sequences
+        if entry.id in chosen.membership
+    }
+    scans = {name: indices for name, indices in found.items() if indices.size}
+    if not scans:
+        raise DatasetNotFoundError(f"{data.manifest.name}: no scan in split {split!r} of {scheme}")
+    return scans
+
+
+def _members(scans: Mapping[str, NDArray[np.int64]], split: str) -> dict[str, NDArray[np.uint8]]:
+    return {name: np.full(len(rows), split_id(split), np.uint8) for name, rows in scans.items()}
+
+
+def _holds(folder: Path, name: str, scheme: str, members: Mapping[str, NDArray[np.uint8]]) -> bool:
+    """Tell whether a folder is a set that was made before, of the same scans."""
+    try:
+        found = open_dataset(folder)
+    except DatasetNotFoundError:
+        return False
+    said = found.manifest
+    if (said.name, said.version, {*said.splits}) != (name, GENERATOR_VERSION, {scheme}):
+        return False
+    there = found.scheme(scheme).membership
+    return there.keys() == members.keys() and all(
+        np.array_equal(there[each], members[each]) for each in members
+    )
 
 
 def _write(

@@ -1,10 +1,13 @@
 import hashlib
+import socket
+import subprocess
+import sys
 from functools import partial
 
 import numpy as np
 import pytest
 
-from semantic2d_dataset import cli
+from semantic2d_dataset import cli, cli_submission
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.corruption import (
     GENERATOR_VERSION,
@@ -13,6 +16,7 @@ from semantic2d_dataset.corruption import (
     corrupt_dataset,
     corrupt_into,
     corruption,
+    remove_partials,
     set_name,
 )
 from semantic2d_dataset.errors import InvalidInputError
@@ -168,6 +172,32 @@ def test_workers_write_what_one_process_writes_and_keep_what_is_there(dataset_fo
         corrupt_dataset(data, other, "dropout", 1)
 
 
+def test_a_set_of_other_scans_is_never_taken_for_the_one_that_is_asked_for(
+    dataset_folder, tmp_path
+):
+    data = open_dataset(dataset_folder)
+    corrupt_into(data, tmp_path, ("rain", 1), scheme="frame")
+    assert corrupt_into(data, tmp_path, ("rain", 1), scheme="frame").name == "rain-1"
+    (tmp_path / "rain-2").mkdir()
+    cases = [(1, "frame", "val"), (1, "block", "test"), (2, "frame", "test")]
+    for severity, scheme, split in cases:
+        with pytest.raises(InvalidInputError, match=f"with {split} of {scheme}; choose another"):
+            corrupt_into(data, tmp_path, ("rain", severity), scheme=scheme, split=split)
+    with pytest.raises(InvalidInputError, match="unknown split 'tset'"):
+        corrupt_into(data, tmp_path, ("rain", 1), scheme="frame", split="tset")
+
+
+def test_what_processes_that_are_gone_left_half_written_is_removed(tmp_path):
+    words = [sys.executable, "-c", "import os; print(os.getpid())"]
+    child = subprocess.run(words, check=True, capture_output=True)
+    owner = f"{socket.gethostname()}-{int(child.stdout)}-00"
+    gone, other = tmp_path / f".rain-1.{owner}.partial", tmp_path / f".rain-2.{owner}.partial"
+    for folder in (gone, other):
+        (folder / "sequences").mkdir(parents=True)
+    remove_partials(tmp_path, [("rain", 1)])
+    assert [*tmp_path.iterdir()] == [other]
+
+
 def test_every_kind_can_be_told_from_the_name_of_its_set():
     for kind in KINDS:
         parts = _SET.fullmatch(f"-{set_name(kind, 3)}")
@@ -195,6 +225,21 @@ def test_what_a_seed_gives_never_changes_without_a_new_version(kind, mini):
 def test_the_corrupted_set_of_mini_is_pinned(mini, tmp_path):
     corrupt_dataset(mini, tmp_path / "rain", "rain", 3)
     assert combined_digest(open_dataset(tmp_path / "rain").manifest) == RAIN_3
+
+
+def test_the_command_says_all_kinds_and_refuses_a_file_or_a_place_that_is_not_there(
+    dataset_folder, tmp_path, monkeypatch, capsys
+):
+    assert cli_submission._KINDS.startswith(", ".join([*KINDS][:-1]) + f" or {[*KINDS][-1]};")
+    (tmp_path / "file").touch()
+    cases = {"file": "is a file", "no/where": "does not exist"}
+    for out, message in cases.items():
+        words = ["semantic2d", "corrupt", str(dataset_folder), str(tmp_path / out)]
+        monkeypatch.setattr("sys.argv", words)
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert (end.value.code, message in capsys.readouterr().err) == (1, True)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_the_command_makes_sets(dataset_folder, tmp_path, monkeypatch, capsys):

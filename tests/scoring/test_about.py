@@ -1,8 +1,10 @@
 import re
 
+import h5py
 import pytest
 import yaml
 
+from semantic2d_dataset import cli
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
@@ -166,3 +168,36 @@ def test_what_no_page_should_get_is_refused(change):
     problems = metadata_problems({"method": "m"} | change)
     assert problems
     assert all(len(problem) < 700 for problem in problems)
+
+
+def test_the_commands_note_what_is_left_out_and_where_a_data_set_is_looked_for(
+    predictions, tmp_path, monkeypatch, capsys
+):
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["semantic2d", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return end.value.code or 0, capsys.readouterr().err
+
+    about = tmp_path / "about.yaml"
+    assert run("submission", "new", predictions, about) == (0, "")
+    status, err = run("submission", "pack", predictions, about, "--out", tmp_path / "s.h5")
+    left_out = "authors, paper, code, hardware, scans_per_second, scans_per_second_measured"
+    assert (status, err) == (0, f"note: {about}: does not say: {left_out}, other_data\n")
+    status, err = run("submission", "validate", tmp_path / "s.h5")
+    assert status == 1
+    assert f"\n{tmp_path / 's.h5'} names it; if you have it in a folder, add --data FOLDER" in err
+
+
+def test_what_a_file_does_not_say_can_be_said_to_the_validator(
+    predictions, dataset_folder, monkeypatch, capsys
+):
+    with h5py.File(predictions, "r+") as file:
+        del file.attrs["scheme"], file.attrs["split"]
+    for more, status in (((), 1), (("--scheme", "block", "--split", "test"), 0)):
+        words = ["submission", "validate", predictions, "--data", dataset_folder, *more]
+        monkeypatch.setattr("sys.argv", ["semantic2d", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert (end.value.code or 0) == status
+        assert ("no problem(s)" in capsys.readouterr().out) == (status == 0)
