@@ -17,6 +17,7 @@ from semantic2d_dataset.scoring.metrics import percent
 
 _SET = re.compile(r"-(?P<kind>[a-z]+(?:-[a-z]+)*)-(?P<severity>[1-9])(?:-seed[0-9]+)?")
 _TASK = ("scheme", "split", "lidars", "evaluator_version")
+_MODEL = ("features", "training_data", "parameters", "seeds")  # compared where both say it
 
 
 def summarise_robustness(clean: Path, corrupted: Iterable[Path]) -> dict[str, Any]:
@@ -105,6 +106,8 @@ def _read(path: Path) -> dict[str, Any]:
         result = load_json(Path(path).read_bytes())
     except InvalidInputError as err:
         raise InvalidInputError(f"{path}: {err}; make it with: semantic2d score --out") from err
+    if isinstance(result, dict) and {"spread", "results"} <= {*result}:
+        raise InvalidInputError(f"{path}: holds several seeds; score each alone, to compare it")
     try:
         said, score = result["submission"], result["mIoU"]
         known = isinstance(score, float | int) and 0 <= score <= 1
@@ -117,21 +120,29 @@ def _read(path: Path) -> dict[str, Any]:
     return dict(result)
 
 
+def _model_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what tells one trained model from another, as far as a file says it."""
+    track = metadata.get("track")
+    said = {**metadata, **(track if isinstance(track, Mapping) else {})}
+    return {name: said[name] for name in ("method", *_MODEL) if name in said}
+
+
 def _set_of(path: Path, result: Mapping[str, Any], base: str) -> tuple[str, int]:
     name = result["submission"]["dataset"]
     parts = _SET.fullmatch(name.removeprefix(base)) if name.startswith(base) else None
     if parts is None:
         raise InvalidInputError(
-            f"{path}: scored on {name!r}, which is no corrupted set of {base}; make one with: "
-            "semantic2d corrupt"
+            f"{path}: scored on {name!r}, which is no corrupted set of {base}; give the result on "
+            "the clean set first, and make the others with: semantic2d corrupt"
         )
     return parts["kind"], int(parts["severity"])
 
 
 def _check_alike(path: Path, said: Mapping[str, Any], clean: Mapping[str, Any]) -> None:
     pairs = {name: (said[name], clean[name]) for name in _TASK}
-    pairs["method"] = said["metadata"]["method"], clean["metadata"]["method"]
-    for name, (found, wanted) in pairs.items():
+    one, other = (_model_of(each["metadata"]) for each in (said, clean))
+    pairs |= {name: (one[name], other[name]) for name in one.keys() & other.keys()}
+    for name, (found, wanted) in sorted(pairs.items()):
         if found != wanted:
             raise InvalidInputError(
                 f"{path}: {name} is {found!r}, but {wanted!r} in the clean result"

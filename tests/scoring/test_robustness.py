@@ -41,12 +41,19 @@ def test_kinds_count_alike_however_many_severities_they_have(write):
 
 
 def test_what_does_not_belong_together_is_refused(write):
-    clean, rain = write("toy", 0.8), write("toy-1.0.0-rain-1", 0.6)
+    model = {"method": "guess", "features": "RIA", "seeds": [0]}
+    clean, rain = write("toy", 0.8, metadata=model), write("toy-1.0.0-rain-1", 0.6)
     cases = {
         "no corrupted set of toy-1.0.0": [write("toy", 0.8)],
         "is no corrupted set": [write("toys-1.0.0-rain-1", 0.5)],
         "given already": [rain, rain],
         "method is 'x'": [write("toy-1.0.0-rain-1", 0.6, metadata={"method": "x"})],
+        "seeds is \\[1\\], but \\[0\\]": [
+            write("toy-1.0.0-rain-1", 0.6, metadata={"method": "guess", "seeds": [1]})
+        ],
+        "features is 'R', but 'RIA'": [
+            write("toy-1.0.0-rain-1", 0.6, metadata={"method": "guess", "track": {"features": "R"}})
+        ],
         "split is 'val'": [write("toy-1.0.0-rain-1", 0.6, split="val")],
         "that has an mIoU": [write("toy-1.0.0-rain-1", None)],
         "at least one": [],
@@ -54,6 +61,18 @@ def test_what_does_not_belong_together_is_refused(write):
     for message, results in cases.items():
         with pytest.raises(InvalidInputError, match=message):
             summarise_robustness(clean, results)
+
+
+def test_the_clean_result_comes_first(write):
+    clean, rain = write("toy", 0.8), write("toy-1.0.0-rain-1", 0.6)
+    with pytest.raises(InvalidInputError, match="give the result on the clean set first"):
+        summarise_robustness(rain, [clean])
+
+
+def test_results_of_several_seeds_are_no_result_of_one_model(write, tmp_path):
+    (tmp_path / "seeds.json").write_text(json.dumps({"spread": {}, "results": []}))
+    with pytest.raises(InvalidInputError, match="holds several seeds; score each alone"):
+        summarise_robustness(tmp_path / "seeds.json", [])
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"mIoU": 1, "submission": []}', "[" * 10**5])
