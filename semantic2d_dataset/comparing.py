@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,11 +37,19 @@ def plot_comparison(found: Comparison) -> Figure:
     _draw_ranges(by_range, found)
     if places:
         _draw_places(parts[1], places)
+        if len(found.places) > len(places):
+            parts[1].suptitle(f"The {len(places)} places where they differ most", fontsize=11)
     patches = [
         Patch(color=colour, label=f"{letter}: {_short(name)}")
         for letter, colour, name in zip("AB", _COLOURS, found.names, strict=True)
     ]
-    figure.legend(handles=patches, loc="outside upper center", ncols=2, frameon=False)
+    figure.legend(
+        handles=patches,
+        loc="outside upper center",
+        ncols=2,
+        frameon=False,
+        title=_what_for(found.task),
+    )
     return figure
 
 
@@ -64,7 +72,8 @@ def _draw_classes(ax: Axes, found: Comparison) -> None:
     names = [name if at < 2 else f"{name} IoU" for at, (name, _) in enumerate(rows)]
     ax.set_yticks(range(len(rows)), names)
     ax.invert_yaxis()
-    ax.set_xlabel(f"B - A (percentage points), {said['level']:.0%} interval")
+    level = f"{said['level']:.0%} interval"
+    ax.set_xlabel(f"A is better  ←  B - A (percentage points), {level}  →  B is better")
     ax.set_title("By class", fontsize=11)
     ax.spines[["top", "right"]].set_visible(False)
 
@@ -106,7 +115,13 @@ def _draw_places(figure: SubFigure, places: Sequence[Place]) -> None:
     figure.colorbar(picture, ax=axes, location="bottom", shrink=0.5, label=label)
 
 
+def _what_for(task: Mapping[str, Any]) -> str:
+    lidars = ", ".join(task["lidars"])
+    what = f"{task['dataset']} {task['dataset_version']}"
+    return f"{_short(what)}, split {task['split']} of {task['scheme']}, {_short(lidars)}"
+
+
 def _short(name: str) -> str:
     """Make a name from a file safe to draw: no mathematics, no end of the picture."""
-    text = name if len(name) <= _NAME else f"{name[:_NAME]} ..."
+    text = name if len(name) <= _NAME else f"{name[: _NAME - 15]} ... {name[-15:]}"
     return text.replace("$", "\\$")

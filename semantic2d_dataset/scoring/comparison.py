@@ -66,7 +66,8 @@ class Comparison:
     Parameters
     ----------
     names
-        What the two submissions call their methods.
+        What the two submissions call their methods, with the names of their files where they
+        call them alike.
     scores
         As `intervals.compare_blocks` returns them.
     conditions
@@ -123,7 +124,7 @@ def compare_predictions(
         If a file cannot be opened safely, or is damaged.
     """
     runner = executor or Serial()
-    task, names = _common_task(a, b, dataset)
+    task, names = _common_task(Path(a), Path(b), dataset)
     tallies = [count_predictions(path, dataset, executor=runner).tallies for path in (a, b)]
     differ = partial(_differ, Path(a), Path(b), dataset)
     found = runner.map(differ, task.scans.items())
@@ -203,7 +204,14 @@ def _common_task(a: Path, b: Path, dataset: ScoredDataset) -> tuple[Task, tuple[
                 f"{b}: {what} {other}, but {one} in {a}; only submissions for the same scans can "
                 "be compared"
             )
+    if names[0] == names[1]:
+        names = [f"{name} ({path})" for name, path in zip(names, _told_apart(a, b), strict=True)]
     return tasks[0], (names[0], names[1])
+
+
+def _told_apart(a: Path, b: Path) -> tuple[str, str]:
+    """Name two files by as little of their paths as tells them apart."""
+    return (a.name, b.name) if a.name != b.name else (str(a), str(b))
 
 
 def _differ(a: Path, b: Path, dataset: ScoredDataset, item: tuple[str, NDArray[np.int64]]) -> Place:

@@ -111,6 +111,53 @@ def test_scores_are_those_of_the_two_results(named, data):
     assert text.startswith("A: worse\nB: better\non generated 1.0.0, split test of frame, small\n")
 
 
+def test_methods_of_one_name_are_told_apart_by_their_files(named, data, tmp_path):
+    (tmp_path / "other").mkdir()
+    same = tmp_path / "other" / named[0].name
+    same.write_bytes(named[0].read_bytes())
+    copy = same.with_name("again.h5")
+    copy.write_bytes(named[0].read_bytes())
+    assert compare_predictions(named[0], copy, data).names == ("worse (a.h5)", "worse (again.h5)")
+    assert compare_predictions(named[0], same, data).names == (
+        f"worse ({named[0]})",
+        f"worse ({same})",
+    )
+
+
+def test_a_submission_is_as_good_as_itself_and_signs_turn_with_the_order(named, data):
+    one, other = (compare_predictions(*pair, data) for pair in (named, named[::-1]))
+    alone = compare_predictions(named[0], named[0], data)
+    for name in ("mIoU", "mCA"):
+        a, b, same = (found.scores[name] for found in (one, other, alone))
+        assert (a["a"], a["b"], a["difference"]) == (b["b"], b["a"], -b["difference"])
+        assert a["interval"] == pytest.approx([-limit for limit in b["interval"][::-1]])
+        assert a["p"] == b["p"]
+        assert (same["difference"], same["interval"], same["p"]) == (0, [0, 0], 1)
+    assert one.outcomes["only_a"] == other.outcomes["only_b"]
+    assert alone.outcomes["only_a"] == alone.outcomes["only_b"] == 0
+
+
+def test_a_picture_never_takes_the_place_of_what_is_compared(named, data, monkeypatch, capsys):
+    picture = named[0].rename(named[0].with_name("a.png"))
+    before = picture.read_bytes()
+    cases = {picture: "is an input itself", named[0].with_name("no") / "x.png": "does not exist"}
+    for out, message in cases.items():
+        words = [
+            "compare",
+            str(picture),
+            str(named[1]),
+            "--data",
+            str(data.root),
+            "--out",
+            str(out),
+        ]
+        monkeypatch.setattr("sys.argv", ["semantic2d", *words])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert (end.value.code, message in capsys.readouterr().err) == (1, True)
+    assert picture.read_bytes() == before
+
+
 def test_submissions_for_different_scans_are_not_compared(named, data, tmp_path):
     other = write(tmp_path / "val.h5", data, 2, "other", split="val")
     with pytest.raises(InvalidInputError, match=r"val\.h5: split val, but test in"):
