@@ -117,11 +117,7 @@ def entry_of(
         "metadata": said["metadata"],
         "digests": said["digests"],
         "evaluator_version": said["evaluator_version"],
-        "taxonomy": {
-            "names": list(taxonomy.names),
-            "colours": [list(colour) for colour in taxonomy.colours],
-            "background_id": taxonomy.background_id,
-        },
+        "taxonomy": taxonomy.as_dict(),
         "result": {name: value for name, value in result.items() if name != "submission"},
     }
     if url is not None:

@@ -62,6 +62,7 @@ class AtHand:
     def _by_digest(self) -> dict[str, Path]:
         if self._files is None:
             found = sorted(self.predictions.rglob("*.h5")) if self.predictions else []
+            found = [path for path in found if path.is_file()]  # a pipe would be read for ever
             bar = tqdm(found, desc="hashing predictions", unit="file", disable=None, leave=False)
             self._files = {file_digest(path): path for path in bar}
         return self._files

@@ -13,7 +13,6 @@ from leaderboard.at_hand import AtHand
 from leaderboard.entries import (
     PUBLISHED,
     Entry,
-    Source,
     file_name,
     list_entries,
     read_entry,
@@ -23,6 +22,7 @@ from leaderboard.figures import Problem, differences, find_inconsistencies
 from leaderboard.published import published_entry
 from leaderboard.rescoring import score_again
 from leaderboard.seeds import find_slips_of_seeds
+from leaderboard.twins import find_nearly_same_counts, find_same_counts, find_same_files
 from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.errors import Semantic2DError
 
@@ -46,6 +46,8 @@ class Checked:
         Why it is unverified, in words.
     problems
         Every field that is wrong.
+    notes
+        What a maintainer should look at; nothing that is wrong by itself.
     predictions, dataset
         What it was verified with; of several seeds, the predictions that are shown.
     """
@@ -55,6 +57,7 @@ class Checked:
     status: str
     reason: str = ""
     problems: tuple[Problem, ...] = ()
+    notes: tuple[str, ...] = ()
     predictions: Path | None = None
     dataset: OpenDataset | None = None
 
@@ -113,6 +116,7 @@ def format_check(checked: Iterable[Checked]) -> str:
         what = f"{each.status}: {each.reason}" if each.reason else each.status
         lines.append(f"{each.path.name}: {what}")
         lines += [f"  - {field_path}: {problem}" for field_path, problem in each.problems]
+        lines += [f"  note: {note}" for note in each.notes]
     return "\n".join(lines)
 
 
@@ -164,25 +168,21 @@ def _compare_dataset(entry: Entry, dataset: OpenDataset) -> Iterator[Problem]:
 
 
 def _mark_twins(checked: list[Checked]) -> list[Checked]:
-    """Refuse the same predictions under two names: which is the impostor cannot be told."""
-    holders: dict[str, list[Path]] = {}
-    for each in checked:
-        for digest in {source.digest for source in _sources_of(each)}:
-            holders.setdefault(digest, []).append(each.path)
+    """Refuse the same predictions under two names, and note those that are nearly the same."""
+    there = [each.entry for each in checked if each.entry is not None]
+    sound = [each.entry for each in checked if each.entry is not None and each.status != WRONG]
+    files, counts, notes = (
+        find_same_files(there),
+        find_same_counts(sound),
+        find_nearly_same_counts(sound),
+    )
     found = []
     for each in checked:
-        problems = [
-            (source.field, f"these predictions are also those of {other.name}")
-            for source in _sources_of(each)
-            for other in [path for path in holders[source.digest] if path != each.path][:1]
-        ]
-        wrong = replace(each, status=WRONG, problems=(*each.problems, *problems))
-        found.append(wrong if problems else each)
+        twins = _unique([*counts.get(each.path, ()), *files.get(each.path, ())])
+        noted = replace(each, notes=tuple(notes.get(each.path, ())))
+        wrong = replace(noted, status=WRONG, problems=(*each.problems, *twins))
+        found.append(wrong if twins else noted)
     return found
-
-
-def _sources_of(checked: Checked) -> tuple[Source, ...]:
-    return checked.entry.sources if checked.entry is not None else ()
 
 
 def _unique(problems: Iterable[Problem]) -> list[Problem]:

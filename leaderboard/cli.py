@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from leaderboard.cli_private import app as private_app
-from semantic2d_dataset.cli_options import AsJson
+from semantic2d_dataset.cli_options import AsJson, open_for
 from semantic2d_dataset.errors import InvalidInputError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None)
@@ -64,8 +65,6 @@ def add(
     """
     from leaderboard.adding import add_entry, make_entry, make_entry_of_seeds
     from leaderboard.entries import SANITY, SCORED
-    from semantic2d_dataset.access.registry import open_dataset
-    from semantic2d_dataset.scoring.predictions import PredictionsReader
 
     urls, several = url or [], len(predictions) > 1
     if urls and len(urls) != len(predictions):
@@ -76,11 +75,7 @@ def add(
     if sanity_row and several:
         raise typer.BadParameter("--sanity is for one file: a sanity row has no seeds")
     _check_entries(entries)
-    with PredictionsReader(predictions[0]) as reader:
-        name = data or reader.dataset
-    if not name:
-        raise InvalidInputError(f"{predictions[0]}: does not name its data set; say it with --data")
-    found, asked = open_dataset(name), {"scheme": scheme, "split": split}
+    found, asked = open_for(predictions[0], data), {"scheme": scheme, "split": split}
     if several:
         entry = make_entry_of_seeds(predictions, found, urls=urls, **asked)
     else:
@@ -132,6 +127,7 @@ def check(
                 "status": each.status,
                 "reason": each.reason,
                 "problems": [{"field": name, "problem": what} for name, what in each.problems],
+                "notes": each.notes,
             }
             for each in found
         ]
@@ -156,15 +152,23 @@ def fetch(
     """Get the predictions that entries point to; each must have the digest that was scored."""
     from leaderboard.entries import list_entries, read_entry
     from leaderboard.fetching import fetch_predictions
+    from semantic2d_dataset.errors import Semantic2DError
 
+    paths, failed = list_entries(entries), 0
     to.mkdir(parents=True, exist_ok=True)
-    for path in list_entries(entries):
-        found = [
-            fetch_predictions(each, to, most_bytes=most_mb * 1_000_000, hosts=host or ())
-            for each in read_entry(path).files()
-        ]
-        for file in found or [None]:
-            typer.echo(f"{path.name}: {file or 'points to no predictions'}")
+    for path in paths:
+        for each in read_entry(path).files():
+            try:
+                found = fetch_predictions(
+                    each, to, most_bytes=most_mb * 1_000_000, hosts=host or ()
+                )
+            except Semantic2DError as err:
+                failed += 1
+                typer.echo(f"error: {err}", err=True)
+            else:
+                typer.echo(f"{path.name}: {found or 'points to no predictions'}")
+    if failed:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -212,7 +216,8 @@ def sanity(
 
     check_target(out, (), force=force)
     predict_sanity(kind, open_dataset(data), out, lidar=lidar, scheme=scheme, split=split)
-    typer.echo(f"wrote {out}; add it with: semantic2d leaderboard add {out} --sanity")
+    command = shlex.join(("semantic2d", "leaderboard", "add", str(out), "--sanity"))
+    typer.echo(f"wrote {out}; add it with: {command}")
 
 
 @app.command()

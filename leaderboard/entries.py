@@ -201,9 +201,7 @@ def taxonomy_of(said: Mapping[str, Any]) -> Taxonomy:
     InvalidInputError
         If they are none.
     """
-    classes = said["taxonomy"]
-    colours = tuple((r, g, b) for r, g, b in classes["colours"])
-    return Taxonomy(tuple(classes["names"]), colours, classes["background_id"])
+    return Taxonomy.from_dict(said["taxonomy"])
 
 
 def seal(said: Mapping[str, Any]) -> dict[str, Any]:

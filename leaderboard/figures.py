@@ -46,6 +46,10 @@ def find_inconsistencies(said: Mapping[str, Any], taxonomy: Taxonomy) -> Iterato
     if not broken:
         yield from _compare_sum(result, taxonomy)
     yield from _check_bands(result, taxonomy)
+    yield from _check_intervals("result", result, taxonomy)
+    for lidar in lidars:
+        path = f"result.per_lidar.{lidar}"
+        yield from _check_intervals(path, result["per_lidar"][lidar], taxonomy)
 
 
 def recount(path: str, scores: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[Problem]:
@@ -116,6 +120,19 @@ def _check_bands(result: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[Prob
         points = sum(band["points"] for band in bands.values())
         if points != result["points"]:
             yield path, f"expected {result['points']} points in its bands, found {points}"
+
+
+def _check_intervals(path: str, scores: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[Problem]:
+    """Find intervals that are none, or of no class."""
+    said = scores.get("intervals", {"classes": {}})
+    strange = sorted({*said["classes"]} - {*taxonomy.names})
+    if strange:
+        yield f"{path}.intervals.classes.{strange[0]}", "expected nothing here"
+    limits = {f"classes.{name}": each for name, each in said["classes"].items()}
+    limits |= {mean: said[mean] for mean in ("mIoU", "mCA") if mean in said}
+    for name, each in limits.items():
+        if each is not None and each[0] > each[1]:
+            yield f"{path}.intervals.{name}", f"expected the lower limit first, found {each}"
 
 
 def _same(expected: Any, found: Any) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from leaderboard.checking import Checked
+from leaderboard.checking import VERIFIED, Checked
 from leaderboard.entries import PUBLISHED, SANITY, SCORED, Entry, Track, features_of
 from leaderboard.published import doubtful_means
 from leaderboard.seeds import names_of_runs
@@ -16,6 +16,9 @@ from semantic2d_dataset.scoring.published import ALL
 
 METRICS = ("iou", "ca")
 TITLES = {"iou": "IoU", "ca": "CA"}
+
+UNRANKED_SCHEMES = ("frame",)
+"""Schemes whose test scans lie 50 ms from train scans: to compare with published figures only."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Row:
-    """One entry in a track; only scored entries have a place."""
+    """One entry in a track; only verified scores have a place, see `is_ranked`."""
 
     checked: Checked
     scores: Scores
@@ -161,7 +164,7 @@ def make_tables(checked: Iterable[Checked]) -> list[TrackTable]:
         )
         ids[name] = ids.get(name, 0) + 1
         same = f"{name}-{ids[name]}" if ids[name] > 1 else name
-        rows = _ranked(groups[track])
+        rows = _ranked(track, groups[track])
         taxonomy = _taxonomy_of(rows[0].entry)
         tables.append(TrackTable(track, same, _title(track), taxonomy, rows))
     return tables
@@ -178,12 +181,9 @@ def scores_of(entry: Entry, lidar: str) -> Scores:
 
 def shown_scores(entry: Entry, lidar: str) -> Scores:
     """Return what the predictions score that are shown in full: of several seeds, of one."""
-    result = entry.said["result"]
-    scores = result["per_lidar"][lidar]
-    # intervals are those of all lidars together
-    limits = result.get("intervals") if len(result["per_lidar"]) == 1 else None
-    limits = limits if isinstance(limits, Mapping) else {}
-    by_class = limits.get("classes") or {}
+    scores = entry.said["result"]["per_lidar"][lidar]
+    limits = scores.get("intervals") or {"classes": {}}
+    by_class = limits["classes"]
     return Scores(
         _with_limits(scores["mIoU"], limits.get("mIoU")),
         _with_limits(scores["mCA"], limits.get("mCA")),
@@ -238,14 +238,20 @@ def facts_of(entry: Entry) -> list[tuple[str, str]]:
     return [(name, str(value)) for name, value in said.items() if value not in (None, "")]
 
 
-def _ranked(rows: Iterable[Row]) -> tuple[Row, ...]:
+def is_ranked(track: Track, checked: Checked) -> bool:
+    """Tell whether a row has a place: nobody's word is enough, and leaking splits are not."""
+    is_scored = entry_of(checked).kind == SCORED and checked.status == VERIFIED
+    return is_scored and track.scheme not in UNRANKED_SCHEMES
+
+
+def _ranked(track: Track, rows: Iterable[Row]) -> tuple[Row, ...]:
     def order(row: Row) -> tuple[bool, float, str]:
         value = row.scores.mIoU.value
         return value is None, -(value or 0.0), row.entry.method
 
     place, found = 0, []
     for row in sorted(rows, key=order):
-        if row.entry.kind == SCORED:
+        if is_ranked(track, row.checked):
             place += 1
             found.append(Row(row.checked, row.scores, place))
         else:

@@ -22,6 +22,7 @@ from leaderboard.entries import PUBLISHED
 from leaderboard.rows import (
     METRICS,
     TITLES,
+    UNRANKED_SCHEMES,
     doubts,
     entry_of,
     facts_of,
@@ -178,6 +179,7 @@ def _environment() -> Environment:
         ),
         "mark": MARK,
         "metrics": METRICS,
+        "unranked": UNRANKED_SCHEMES,
         "titles": TITLES,
         "levels": _LEVELS,
         "grid": charts.grid(),

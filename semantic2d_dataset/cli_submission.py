@@ -6,15 +6,12 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
-from semantic2d_dataset.errors import DatasetNotFoundError, InvalidInputError, WriteError
-
-if TYPE_CHECKING:
-    from semantic2d_dataset.access.registry import OpenDataset
+from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler, open_for
+from semantic2d_dataset.errors import InvalidInputError, WriteError
 
 submission = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 
@@ -52,7 +49,7 @@ def score(
     from semantic2d_dataset.scoring import submission as scoring
 
     _check_out(out, *predictions)
-    found = _open_for(predictions[0], data)
+    found = open_for(predictions[0], data)
     with open_executor(jobs=jobs, scheduler=scheduler) as executor:
         results = [
             scoring.score_predictions(
@@ -93,7 +90,7 @@ def score_part(
     with open_executor(jobs=jobs) as executor:
         counts = count_predictions(
             predictions,
-            _open_for(predictions, data),
+            open_for(predictions, data),
             scheme=scheme,
             split=split,
             part=(int(found[1]), int(found[2])),
@@ -131,7 +128,7 @@ def report(
     from semantic2d_dataset.reports import write_report
 
     _check_out(out, predictions)
-    write_report(out, predictions, _open_for(predictions, data), scheme=scheme, split=split)
+    write_report(out, predictions, open_for(predictions, data), scheme=scheme, split=split)
     typer.echo(f"wrote {out}")
 
 
@@ -154,7 +151,7 @@ def compare(
         check_picture_name(out)
         _check_out(out, a, b)
     with open_executor(jobs=jobs) as executor:
-        found = compare_predictions(a, b, _open_for(a, data), executor=executor)
+        found = compare_predictions(a, b, open_for(a, data), executor=executor)
     if out is not None:
         from semantic2d_dataset.comparing import plot_comparison
         from semantic2d_dataset.plotting import save
@@ -269,7 +266,7 @@ def validate(
 
     with open_executor(jobs=jobs) as executor:
         problems = validation.validate(
-            path, _open_for(path, data), scheme=scheme, split=split, executor=executor
+            path, open_for(path, data), scheme=scheme, split=split, executor=executor
         )
     if as_json:
         typer.echo(json.dumps({"problems": problems}, indent=1))
@@ -319,29 +316,6 @@ def _tell(
         count = said["spread"]["count"]
         typer.echo(f"\nMean and standard deviation over {count} seeds, percent")
         typer.echo(scoring.format_spread(said["spread"]))
-
-
-def _open_for(predictions: Path, data: str | None) -> OpenDataset:
-    """Open the data set that is given, or else the one that the predictions name."""
-    from semantic2d_dataset.access.registry import open_dataset
-    from semantic2d_dataset.scoring.predictions import PredictionsReader
-
-    with PredictionsReader(predictions) as reader:
-        name = data or reader.dataset
-    if not name:
-        raise InvalidInputError(f"{predictions}: does not name its data set; say it with --data")
-    if data is None and "/" in name:  # a file from elsewhere chooses no folder of this machine
-        raise InvalidInputError(
-            f"{predictions}: names the data set {name!r}, which is a path; say it with --data"
-        )
-    try:
-        return open_dataset(name)
-    except DatasetNotFoundError as err:
-        if data is not None:
-            raise
-        raise DatasetNotFoundError(
-            f"{err}\n{predictions} names it; if you have it in a folder, add --data FOLDER"
-        ) from err
 
 
 def _check_out(out: Path | None, *sources: Path) -> None:

@@ -442,7 +442,6 @@ def _check_lengths(path: Path, rows: Mapping[str, int]) -> None:
 
 
 def _attributes_of(header: SequenceHeader) -> dict[str, dict[str, Any]]:
-    taxonomy = header.taxonomy
     return {
         "": root_attributes(
             SEQUENCE,
@@ -452,10 +451,5 @@ def _attributes_of(header: SequenceHeader) -> dict[str, dict[str, Any]]:
             license=header.license,
         ),
         "lidar": asdict(header.lidar) | {"base_T_lidar": list(header.lidar.base_T_lidar)},
-        "taxonomy": {
-            "names": list(taxonomy.names),
-            "colours": [list(colour) for colour in taxonomy.colours],
-            "background_id": taxonomy.background_id,
-            "ignore_id": UNLABELLED,
-        },
+        "taxonomy": header.taxonomy.as_dict() | {"ignore_id": UNLABELLED},
     }

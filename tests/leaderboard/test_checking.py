@@ -228,3 +228,50 @@ def test_predictions_that_were_changed_are_named(board, dataset_folder, tmp_path
     (found,) = check_entries(board, AtHand([str(dataset_folder)], folder))
     assert found.problems[0][0] == "digests.predictions"
     assert "mine.h5 is of this method, and its SHA-256 is another" in found.problems[0][1]
+
+
+@pytest.mark.parametrize("owner", ["whole", "lidar"])
+def test_an_interval_that_is_upside_down_is_named(board, owner):
+    path, said = one_of(board)
+    result, field = said["result"], "result"
+    if owner == "lidar":
+        result, field = result["per_lidar"]["small"], "result.per_lidar.small"
+    result["intervals"]["mCA"] = [0.9, 0.1]
+    result["intervals"]["classes"]["Chair"] = [0.6, 0.5]
+    path.write_text(to_json(seal(said)))
+    named = {name for name, _ in check_entry(path, AtHand()).problems}
+    assert named == {f"{field}.intervals.mCA", f"{field}.intervals.classes.Chair"}
+
+
+def test_a_pipe_among_the_predictions_is_passed_over(board, predictions_folder, tmp_path):
+    os.mkfifo(tmp_path / "never.h5")
+    (tmp_path / "gone.h5").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "folder.h5").mkdir()
+    shutil.copy(predictions_folder / "fair.h5", tmp_path)
+    at_hand = AtHand(predictions=tmp_path)
+    digests = [json.loads(p.read_text())["digests"]["predictions"] for p in sorted(board.iterdir())]
+    assert [at_hand.file(d) is not None for d in digests] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("predictions_url", f"https://{rest}") for rest in ("", "a\\@b/c", 'a/"x', "a/\u202ex")),
+        ("predictions_url", "http://a/b"),
+        *(("evaluator_version", version) for version in ("01.0", "1.00", "1", "1.0\n")),
+        ("digests.split", "0" * 64 + "\n"),
+        ("track.split", "train"),
+        ("taxonomy.names", ["Other", "Cha\u200bir"]),
+    ],
+)
+def test_values_that_nobody_needs_are_refused(board, field, value):
+    path, said = one_of(board)
+    *owners, name = field.split(".")
+    owner = said
+    for each in owners:
+        owner = owner[each]
+    owner[name] = value
+    path.write_text(to_json(seal(said)))
+    checked = check_entry(path, AtHand())
+    assert checked.status == WRONG
+    assert field in str(checked.problems)

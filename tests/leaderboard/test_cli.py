@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from leaderboard.cli import app
+from leaderboard.entries import seal, to_json
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scoring.submission import result_to_json
 from tests.leaderboard.test_table import TRUTH, result_of
@@ -150,3 +151,24 @@ def test_what_is_not_there_is_an_error_and_no_traceback(words, tmp_path, monkeyp
     found = run(*words)
     assert isinstance(found.exception, InvalidInputError | FileNotFoundError)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_address_that_fails_stops_no_other(board, tmp_path):
+    paths = sorted(board.iterdir())
+    for path in paths[:2]:
+        said = json.loads(path.read_text())
+        said["predictions_url"] = f"https://other.example/{path.stem}.h5"
+        path.write_text(to_json(seal(said)))
+    found = run(
+        *("fetch", "--entries", board, "--to", tmp_path / "files", "--host", "zenodo.org"),
+    )
+    assert found.exit_code == 1
+    assert found.stderr.count("other.example is none of zenodo.org") == 2
+    assert f"{paths[2].name}: points to no predictions" in found.stdout
+
+
+def test_a_path_with_spaces_is_told_so_that_it_can_be_typed(tmp_path, dataset_folder):
+    out = tmp_path / "my files" / "majority.h5"
+    out.parent.mkdir()
+    words = ("--data", dataset_folder, "--lidar", "small")
+    assert f"add '{out}' --sanity" in run("sanity", "majority", "--out", out, *words).stdout

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import re
 import shutil
@@ -10,7 +11,7 @@ from leaderboard.at_hand import AtHand
 from leaderboard.checking import check_entries
 from leaderboard.entries import file_name, seal, to_json
 from leaderboard.published import published_entries
-from leaderboard.rows import make_tables
+from leaderboard.rows import is_ranked, make_tables
 from leaderboard.site import build_site
 from semantic2d_dataset.errors import InvalidInputError
 from tests.leaderboard.boards import edited, with_extras
@@ -226,10 +227,15 @@ def test_seeds_are_one_row_at_their_mean_with_its_deviation(
     assert f'{100 * chair["mean"]:.1f} <span class="std">± {100 * chair["std"]:.1f}</span>' in row
 
 
-def test_a_rank_is_that_of_the_mean_and_not_of_the_seed_that_is_shown(board, entry_of_seeds):
+def test_a_rank_is_that_of_the_mean_and_not_of_the_seed_that_is_shown(
+    board, entry_of_seeds, predictions_folder, seeds_folder, dataset_folder, tmp_path
+):
     """Another method stands between the two."""
     add_entry(entry_of_seeds, board)
-    (table,) = make_tables(check_entries(board, AtHand()))
+    for folder in (predictions_folder, seeds_folder):
+        shutil.copytree(folder, tmp_path / "predictions" / folder.name)
+    at_hand = AtHand([str(dataset_folder)], tmp_path / "predictions")
+    (table,) = make_tables(check_entries(board, at_hand))
     (row,) = (row for row in table.rows if row.entry.runs)
     assert row.scores.mIoU.value == entry_of_seeds["seeds"]["spread"]["mIoU"]["mean"]
     assert row.scores.mIoU.value != entry_of_seeds["result"]["mIoU"]
@@ -239,6 +245,24 @@ def test_a_rank_is_that_of_the_mean_and_not_of_the_seed_that_is_shown(board, ent
     assert table.best("iou", "Chair") == max(
         r.scores.classes["iou"]["Chair"].value for r in table.rows
     )
+
+
+def test_only_verified_rows_have_a_rank(board, predictions_folder, dataset_folder, tmp_path):
+    shutil.copy(predictions_folder / "fair.h5", tmp_path / "fair.h5")
+    (table,) = make_tables(check_entries(board, AtHand([str(dataset_folder)], tmp_path)))
+    assert [(row.entry.method, row.place) for row in table.rows] == [
+        ("Good", None),
+        ("Fair", 1),
+        ("Poor", None),
+    ]
+    assert table.best("iou") == table.rows[1].scores.mIoU.value
+
+
+def test_frame_has_no_ranks(board, predictions_folder, dataset_folder):
+    (checked, *_) = check_entries(board, AtHand([str(dataset_folder)], predictions_folder))
+    (track,) = checked.entry.tracks()
+    assert is_ranked(track, checked)
+    assert not is_ranked(dataclasses.replace(track, scheme="frame"), checked)
 
 
 def test_the_page_of_seeds_says_which_one_is_shown_and_lists_all(
