@@ -220,13 +220,17 @@ def _write(
 
 def _metadata(checkpoint: Checkpoint, method: str, seed: int) -> dict[str, Any]:
     trained_on = " ".join(str(value) for value in checkpoint.dataset.values())
-    return {
+    said = {
         "method": method,
         "features": checkpoint.features,
         "training_data": trained_on or "unknown",
         "parameters": sum(p.numel() for p in checkpoint.network.parameters()),
-        "seeds": [seed],
     }
+    if "seed" in checkpoint.training:
+        said["seeds"] = [checkpoint.training["seed"]]
+    if isinstance(checkpoint.network, S3Net):
+        said["sampling_seed"] = seed
+    return said
 
 
 def _check_dataset(checkpoint: Checkpoint, dataset: LidarDataset) -> None:

@@ -126,6 +126,16 @@ def checkpoint(network: S3Net, scans: LidarDataset) -> Checkpoint:
     return Checkpoint(network, "RIA", scans.statistics, scans.lidar, scans.taxonomy)
 
 
+def test_predictions_say_with_which_seed_their_model_was_trained(checkpoint, scans, tmp_path: Path):
+    trained = replace(checkpoint, training={"seed": 7})
+    for name, model in (("unknown", checkpoint), ("trained", trained)):
+        predict(model, scans, tmp_path / f"{name}.h5", samples=1, seed=3)
+    with PredictionsReader(tmp_path / "trained.h5") as reader:
+        assert (reader.metadata["seeds"], reader.metadata["sampling_seed"]) == ([7], 3)
+    with PredictionsReader(tmp_path / "unknown.h5") as reader:
+        assert "seeds" not in reader.metadata
+
+
 def test_predictions_of_a_split_are_valid_and_complete(
     checkpoint, scans, dataset_folder: Path, tmp_path: Path
 ):
