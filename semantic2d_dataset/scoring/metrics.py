@@ -156,7 +156,8 @@ class Evaluator:
             mean: [figure for scores in scored if (figure := scores[key]) is not None]
             for mean, key in MEANS.items()
         }
-        means = {mean: sum(v) / len(v) if v else None for mean, v in present.items()}
+        # as scikit-learn rounds it; `sum` rounds otherwise from Python 3.12 on
+        means = {mean: float(np.mean(v)) if v else None for mean, v in present.items()}
         return {
             **means,
             **classes,

@@ -38,6 +38,7 @@ def check_against_scikit_learn(case):
     assert result["ignored"] == truth.size - t.size
     if t.size == 0:
         assert np.sum(result["confusion"]) == 0
+        assert result["mIoU"] is result["mCA"] is result["Chair"]["iou"] is None
         return
     assert (np.array(result["confusion"]) == confusion_matrix(t, p, labels=ALL)).all()
     iou = jaccard_score(t, p, labels=ALL, average=None, zero_division=0)
@@ -47,6 +48,11 @@ def check_against_scikit_learn(case):
         assert result[name]["iou"] == (iou[c] if in_truth or in_prediction else None)
         assert result[name]["ca"] == (recall[c] if in_truth else None)
         assert result[name]["support"] == (t == c).sum()
+    there = {"mIoU": np.union1d(t, p), "mCA": np.unique(t)}
+    for mean, figures in (("mIoU", iou), ("mCA", recall)):
+        averaged = there[mean][there[mean] > 0]  # as average="macro" of those classes
+        assert result[mean] == (np.average(figures[averaged]) if averaged.size else None)
+        assert result["classes_averaged"][mean] == averaged.size
 
 
 @settings(deadline=None)
@@ -77,6 +83,16 @@ def test_both_ways_to_count_agree_on_any_bytes(seed, size, classes, masked):
     plain = metrics._count_any(truth, prediction, valid, classes)
     assert (packed[0] == plain[0]).all()
     assert packed[1] == plain[1]
+
+
+def test_means_are_the_macro_averages_of_scikit_learn_to_the_last_digit():
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        truth = rng.integers(0, CLASSES, 300)
+        guess = np.where(rng.random(300) < 0.3, rng.integers(0, CLASSES, 300), truth)
+        result = Evaluator().update(truth, guess).compute()
+        for mean, score in (("mIoU", jaccard_score), ("mCA", recall_score)):
+            assert result[mean] == score(truth, guess, labels=ALL[1:], average="macro")
 
 
 @settings(deadline=None)

@@ -9,16 +9,20 @@ from semantic2d_dataset.scoring.published import ALL, METRICS, published_segment
 
 TABLE = published_segmentation()
 CLASSES = {SEMANTIC2D.names[c] for c in SEMANTIC2D.scored_ids}
-SLIPS = {("S3-Net", "IPA", "CA"): 0.0223}
-"""Printed means that lie farther than 0.02 percent from those of the printed classes."""
+ROUNDED = 0.005 + 0.005  # percent: the mean of printed classes, and the printed mean
+SLIPS = {("RIP", "CA"): (36.40, 36.39), ("IPA", "CA"): (37.20, 37.22)}
+"""Means in percent, printed and of the printed classes, that rounding does not explain."""
 
 
-@pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("row", TABLE.rows, ids=lambda row: f"{row.method} {row.features}")
-def test_a_printed_mean_is_that_of_the_printed_classes(row, metric):
-    means = {name: mean for name, (mean, _) in row.figures[metric].items()}
-    apart = 100 * abs(means.pop(ALL) - fmean(means.values()))
-    assert apart <= SLIPS.get((row.method, row.features, metric), 0.02)
+def test_every_printed_mean_but_two_is_that_of_the_printed_classes():
+    wrong = {}
+    for row in TABLE.rows:
+        for metric in METRICS:
+            means = {name: 100 * mean for name, (mean, _) in row.figures[metric].items()}
+            printed, found = means.pop(ALL), fmean(means.values())
+            if abs(printed - found) > ROUNDED + 1e-9:
+                wrong[row.features, metric] = (pytest.approx(printed), round(found, 2))
+    assert wrong == SLIPS
 
 
 def test_the_table_has_two_detectors_and_every_combination_of_features():
