@@ -14,6 +14,7 @@ FIRST, ROWS, BEAMS = "hall--a--near", 68, 12
 CRAFTED = {}
 GROUP = f"predictions/{FIRST}"
 LABELS, INDEX, META = f"{GROUP}/labels", f"{GROUP}/scan_index", "metadata"
+SAMPLES = f"{GROUP}/samples"
 
 
 def crafted(build):
@@ -61,16 +62,15 @@ def links():
     yield "soft link to labels", lambda f, _: f.__setitem__(LABELS, h5py.SoftLink(f"/{INDEX}"))
     yield (
         "soft link to nothing",
-        lambda f, _: f.__setitem__(f"{GROUP}/samples", h5py.SoftLink("/no")),
+        lambda f, _: f.__setitem__(SAMPLES, h5py.SoftLink("/no")),
     )
     yield "hard link in a circle", lambda f, _: f.__setitem__("predictions/x", f["/"])
-    yield "hard link to another part", lambda f, _: f.__setitem__(f"{GROUP}/samples", f[INDEX])
+    yield "hard link to another part", lambda f, _: f.__setitem__(SAMPLES, f[INDEX])
 
 
 def relink(change):
     def build(file, canary):
-        if LABELS in file:
-            del file[LABELS]
+        del file[LABELS], file[SAMPLES]
         change(file, str(canary))
 
     return build
@@ -118,13 +118,13 @@ def bomb_of_labels(file, _):
 
 @crafted
 def bomb_of_samples(file, _):
-    bomb(file, f"{GROUP}/samples", (60_000, ROWS, BEAMS), (60_000, ROWS, BEAMS), np.uint8)
+    bomb(file, SAMPLES, (60_000, ROWS, BEAMS), (60_000, ROWS, BEAMS), np.uint8)
 
 
 @crafted
 def bomb_of_thousand_samples_in_one_chunk_a_scan(file, _):
     shape = (1024, ROWS, BEAMS)
-    bomb(file, f"{GROUP}/samples", shape, (1024, 1, BEAMS), np.uint8)
+    bomb(file, SAMPLES, shape, (1024, 1, BEAMS), np.uint8)
 
 
 @crafted
@@ -315,11 +315,7 @@ def mutation(seed):
     def build(file, _):
         name = str(
             rng.choice(
-                [
-                    f"predictions/{n}/{p}"
-                    for n in file["predictions"]
-                    for p in ("labels", "scan_index")
-                ]
+                [f"predictions/{n}/{p}" for n, parts in file["predictions"].items() for p in parts]
             )
         )
         values = file[name][:]
@@ -349,9 +345,9 @@ def mutation(seed):
             values[at] = rng.choice([values[at - 1], -1, 1, 70, 10**6, -(2**63), 2**63 - 1])
             put(file, name, values)
         elif kind == "labels":
-            name = name.rsplit("/", 1)[0] + "/labels"
+            name = name.rsplit("/", 1)[0] + str(rng.choice(["/labels", "/samples"]))
             values = file[name][:]
-            values[rng.integers(len(values)), rng.integers(values.shape[1])] = rng.integers(10, 256)
+            values[tuple(rng.integers(values.shape))] = rng.integers(10, 256)
             put(file, name, values)
 
     return kind, rng, build
