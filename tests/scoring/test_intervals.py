@@ -9,21 +9,24 @@ from semantic2d_dataset.scoring.metrics import Evaluator
 
 def make_blocks(share_right, *, blocks=40, seed=0, points=500, classes=10):
     """Blocks whose truth depends on the seed 7 alone, and predictions that are often right."""
-    truths = np.random.default_rng(7).integers(0, classes, (blocks, points))
+    shape = (blocks, points)
+    truth = np.random.default_rng(7).integers(0, classes, shape)
     rng = np.random.default_rng(seed)
-    matrices = []
-    for truth in truths:
-        right = rng.random(points) < share_right + rng.normal(0, 0.05)
-        guess = np.where(right, truth, rng.integers(0, classes, points))
-        matrices.append(Evaluator().update(truth, guess).confusion)
-    windows = tuple(("hall--a", n) for n in range(blocks))
-    return Blocks(windows, np.stack(matrices), SEMANTIC2D)
+    right = rng.random(shape) < share_right + rng.normal(0, 0.05, (blocks, 1))
+    guess = np.where(right, truth, rng.integers(0, classes, shape))
+    keys = (np.arange(blocks)[:, None] * 10 + truth) * 10 + guess
+    confusion = np.bincount(keys.ravel(), minlength=100 * blocks).reshape(blocks, 10, 10)
+    return Blocks(tuple(("hall--a", n) for n in range(blocks)), confusion, SEMANTIC2D)
+
+
+def scores_of(confusion):
+    evaluator = Evaluator()
+    evaluator.confusion = confusion
+    return evaluator.compute()
 
 
 def miou(confusion):
-    evaluator = Evaluator()
-    evaluator.confusion = confusion
-    return evaluator.compute()["mIoU"]
+    return scores_of(confusion)["mIoU"]
 
 
 def test_an_interval_is_that_of_scores_of_resampled_blocks():
@@ -40,14 +43,15 @@ def test_an_interval_is_that_of_scores_of_resampled_blocks():
 
 
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
-    whole = make_blocks(0.6, blocks=4000, points=60)
-    true = miou(whole.confusion.sum(axis=0))
-    held = 0
-    for part in np.split(np.arange(4000), 80):
+    whole = make_blocks(0.6, blocks=6000, points=60)
+    true = {name: scores_of(whole.confusion.sum(axis=0))[name] for name in ("mIoU", "mCA")}
+    held = dict.fromkeys(true, 0)
+    for part in np.split(np.arange(6000), 100):
         blocks = Blocks(tuple(("r", n) for n in part), whole.confusion[part], SEMANTIC2D)
-        low, high = intervals(blocks, draws=300)["mIoU"]
-        held += low <= true <= high
-    assert 0.85 <= held / 80 <= 1.0
+        said = intervals(blocks, draws=200)
+        for name, value in true.items():
+            held[name] += said[name][0] <= value <= said[name][1]
+    assert all(90 <= count <= 99 for count in held.values()), held
 
 
 def test_one_block_has_no_interval_and_an_absent_class_neither():
@@ -72,17 +76,45 @@ def test_a_better_submission_is_told_from_a_worse_one_and_alike_ones_are_not():
     assert (same["difference"], same["interval"], same["p"]) == (0.0, [0.0, 0.0], 1.0)
 
 
-def test_the_p_value_is_right_about_as_often_as_it_says():
+def differences(one, other):
+    first, second = (scores_of(blocks.sum(axis=0)) for blocks in (one, other))
+    return {
+        "mIoU": second["mIoU"] - first["mIoU"],
+        "mCA": second["mCA"] - first["mCA"],
+        "Other": second["Other"]["iou"] - first["Other"]["iou"],
+    }
+
+
+def test_a_comparison_is_that_of_resampled_and_of_swapped_blocks():
+    blocks_a, blocks_b = make_blocks(0.57, seed=1, blocks=12), make_blocks(0.6, seed=2, blocks=12)
+    a, b = blocks_a.confusion, blocks_b.confusion
+    weights = np.random.default_rng(5).multinomial(12, np.full(12, 1 / 12), 300)[..., None, None]
+    swaps = np.random.default_rng((5, 1)).integers(0, 2, (300, 12))[..., None, None] == 1
+    found = differences(a, b)
+    drawn = [differences(w * a, w * b) for w in weights]
+    swapped = [differences(np.where(s, b, a), np.where(s, a, b)) for s in swaps]
+    said = compare_blocks(blocks_a, blocks_b, draws=300, seed=5)
+    for name, row in (said | said["classes"]).items():
+        if name in found:
+            assert row["difference"] == pytest.approx(found[name], abs=1e-12)
+            limits = np.quantile([each[name] for each in drawn], (0.025, 0.975))
+            assert row["interval"] == pytest.approx(limits.tolist(), abs=1e-12)
+            farther = sum(abs(each[name]) >= abs(found[name]) - 1e-12 for each in swapped)
+            assert row["p"] == (1 + farther) / 301
+            assert 1 < farther < 290  # so that it tells one from another
+
+
+def test_p_values_are_spread_evenly_where_there_is_no_difference():
     p = [
         compare_blocks(
-            make_blocks(0.6, seed=n, blocks=25, points=80),
-            make_blocks(0.6, seed=n + 500, blocks=25, points=80),
-            draws=199,
+            make_blocks(0.6, seed=n, blocks=20, points=80),
+            make_blocks(0.6, seed=n + 500, blocks=20, points=80),
+            draws=99,
         )["mIoU"]["p"]
-        for n in range(80)
+        for n in range(120)
     ]
-    assert 0.0 <= np.mean(np.array(p) <= 0.1) <= 0.2
-    assert np.mean(np.array(p) <= 0.5) > 0.3
+    shares = {level: np.mean(np.array(p) <= level) for level in (0.1, 0.25, 0.5, 0.75, 0.9)}
+    assert all(abs(share - level) < 0.1 for level, share in shares.items()), shares
 
 
 def test_swapping_the_two_changes_the_sign_alone():

@@ -283,14 +283,35 @@ def test_score_as_text_says_what_was_scored_and_how_each_lidar_did(dataset, pred
     assert any(line.startswith("Mean") for line in lines)
 
 
-def test_order_and_blocks_never_change_the_score(dataset, predictions, tmp_path, monkeypatch):
-    expected = score_predictions(predictions, dataset)
-    order = np.random.default_rng(3).permutation(len(TEST_SCANS))
-    shuffled = write_predictions(tmp_path / "p.h5", dataset, order=order, blocks=3)
-    monkeypatch.setattr(tallies, "_BLOCK", 7)
-    found = score_predictions(shuffled, dataset)
-    del expected["submission"], found["submission"]
-    assert found == expected
+def write_everything(path, dataset, *, shuffled):
+    """Labels, probabilities and samples; scans and sequences in order, or in none."""
+    rng = np.random.default_rng(3)
+    names = [entry.id for entry in dataset.manifest.sequences]
+    with writer_of(path) as writer:
+        for name in names[::-1] if shuffled else names:
+            labels = guesses(dataset, name)
+            scans = np.arange(len(TEST_SCANS))
+            scans = rng.permutation(scans) if shuffled else scans
+            probabilities = np.eye(10)[guesses(dataset, name, 1)] * 0.75 + 0.025
+            samples = np.stack([guesses(dataset, name, seed) for seed in (2, 3)])
+            for rows in np.array_split(scans, 3 if shuffled else 1):
+                said = labels[rows], probabilities[rows].astype(np.float16), samples[:, rows]
+                writer.add(name, TEST_SCANS[rows], *said)
+    return path
+
+
+def test_order_of_scans_sequences_and_blocks_changes_no_byte_of_the_result(
+    dataset, tmp_path, monkeypatch
+):
+    written = []
+    for shuffled, block in ((False, tallies._BLOCK), (True, 7)):
+        monkeypatch.setattr(tallies, "_BLOCK", block)
+        path = write_everything(tmp_path / f"{block}.h5", dataset, shuffled=shuffled)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        written.append(result_to_json(score_predictions(path, dataset)).replace(digest, "?"))
+    assert written[0] == written[1]
+    assert json.loads(written[0])["submission"]["digests"]["predictions"] == "?"
+    assert {"calibration", "samples"} < {*json.loads(written[0])}
 
 
 def test_ground_truth_given_as_predictions_scores_exactly_one(dataset, tmp_path):
