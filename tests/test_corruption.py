@@ -1,4 +1,5 @@
 import hashlib
+import re
 import socket
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from semantic2d_dataset.executors import Processes
 from semantic2d_dataset.format.manifest import find_problems
 from semantic2d_dataset.scoring.robustness import _SET
 from semantic2d_dataset.simulation.mini import combined_digest
+from tests.conftest import PROJECT
 from tests.generators import SMALL_LIDAR, make_arrays
 
 PINNED = {
@@ -72,6 +74,47 @@ def test_the_given_arrays_stay_and_shapes_and_dtypes_are_kept(kind):
         assert (after[name].shape, after[name].dtype) == (values.shape, values.dtype)
 
 
+def measured_level(kind, before, after):
+    """What a corruption did, in the unit of its parameter."""
+    there, still = (SMALL_LIDAR.has_return(fields["ranges"]) for fields in (before, after))
+    ranges, changed = before["ranges"], after["ranges"]
+    if kind == "range-noise":
+        inner = there & (ranges > 3)  # not cut at the limits of the lidar
+        return (changed[inner] - ranges[inner]).std()
+    if kind == "dropout":
+        return (there & ~still).sum() / there.sum()
+    if kind == "dimming":
+        ratio = after["intensities"] / before["intensities"]
+        assert np.ptp(ratio) < 1e-6
+        return ratio.mean()
+    if kind == "coarse":
+        borders = (np.diff(after["labels"], axis=1) != 0).any(axis=0)
+        return np.diff(np.flatnonzero(borders)).max()
+    if kind == "short-range":
+        return (ranges[there & ~still].min() + changed[still].max()) / 2
+    hit = (changed < ranges) & ~np.isneginf(changed)
+    return hit.sum() / (there | np.isposinf(ranges)).sum()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_kind_does_what_the_table_of_the_guide_says(kind):
+    (row,) = re.findall(rf"\| `{kind}` \| (.*?) \|", (PROJECT / "docs/scoring.md").read_text())
+    unit = 100 if "%" in row else 1
+    promised = [float(number) / unit for number in re.findall(r"[0-9.]+", row)[:5]]
+    assert list(KINDS[kind][0]) == promised
+    before = make_fields()
+    for severity, level in zip(SEVERITIES, promised, strict=True):
+        after = apply(kind, severity, before)
+        close = 0.01 if kind in {"dropout", "rain"} else 0
+        assert measured_level(kind, before, after) == pytest.approx(level, rel=0.03, abs=close)
+
+
+@pytest.mark.parametrize("at", [6.0, np.nextafter(np.float32(6), np.float32(0))])
+def test_what_lies_exactly_at_the_shortened_range_gives_no_return(at):
+    ranges = np.full((1, SMALL_LIDAR.beams), at, np.float32)
+    assert (np.isposinf(apply("short-range", 3, {"ranges": ranges})["ranges"]) == (at == 6)).all()
+
+
 def test_dropped_and_far_beams_have_no_return_and_others_are_as_they_were():
     before = make_fields()
     for kind in ("dropout", "short-range"):
@@ -105,6 +148,9 @@ def test_rain_falls_before_what_a_beam_hits_and_is_background():
     assert (after["ranges"][changed] <= np.minimum(hits[changed], 10.0)).all()
     assert SMALL_LIDAR.has_return(after["ranges"][changed]).all()
     assert (after["labels"][changed] == 0).all()
+    shine = after["intensities"] / before["intensities"]
+    assert shine[changed] == pytest.approx(0.3)
+    assert (shine[~changed] == 1).all()
     assert (after["labels"][~changed] == before["labels"][~changed]).all()
     too_close = np.isneginf(before["ranges"])
     assert np.isneginf(after["ranges"][too_close]).all()
