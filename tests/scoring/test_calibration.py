@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D, Taxonomy
-from semantic2d_dataset.scoring.calibration import BINS, Calibration
+from semantic2d_dataset.scoring.calibration import BINS, Calibration, are_probabilities
 
 CLASSES = len(SEMANTIC2D)
 
@@ -159,6 +159,42 @@ def test_what_cannot_be_counted_is_refused_and_leaves_nothing(
     with pytest.raises(InvalidInputError, match=message):
         calibration.update(truth, probabilities, valid)
     assert calibration.compute() == Calibration().compute()
+
+
+@pytest.mark.parametrize(
+    ("row", "good"),
+    [
+        ([0.5, 0.485], True),  # rounding of half precision
+        ([0.5, 0.475], False),
+        ([0.5, 0.515], True),
+        ([0.5, 0.525], False),
+        ([1.0, 0.0], True),
+        ([1.01, 0.0], False),
+        ([1.01, -0.01], False),
+        ([np.nan, 1.0], False),
+        ([np.inf, 0.0], False),
+    ],
+)
+def test_the_validator_and_the_evaluator_take_the_same_rows_for_probabilities(row, good):
+    rows = np.zeros((1, 2, CLASSES), np.float32)
+    rows[0] = [[*row, *[0.0] * (CLASSES - 2)], np.eye(CLASSES)[3]]
+    assert are_probabilities(rows).tolist() == [[good, True]]
+    if good:
+        Calibration().update([[0, 3]], rows)
+    else:
+        with pytest.raises(InvalidInputError, match=r"probabilities\[0, 0\]"):
+            Calibration().update([[0, 3]], rows)
+
+
+def test_bins_are_fifteen_of_equal_width_and_a_value_between_two_is_of_the_upper():
+    result = Calibration().compute()
+    assert BINS == len(result["confidence_bins"]) == len(result["entropy_bins"]) == 15
+    lows = [row["low"] for row in result["entropy_bins"]]
+    assert lows == pytest.approx(np.arange(15) * np.log(CLASSES) / 15)
+    halves = np.zeros((1, 1, CLASSES), np.float32)
+    halves[..., :2] = 0.5
+    result = Calibration(bins=2).update([[0]], halves).compute()
+    assert [row["points"] for row in result["confidence_bins"]] == [0, 1]
 
 
 def test_probabilities_of_points_that_are_not_counted_may_be_anything():
