@@ -147,6 +147,7 @@ def changed(value):
         ([[0, 1]], GOOD[:, :, :9], None, r"probabilities: expected floats of shape \(1, 2, 10\)"),
         ([[0, 1]], GOOD.astype(int), None, "probabilities: expected floats"),
         ([[0, 10]], GOOD, None, r"truth\[0, 1\]: expected a class id 0 to 9"),
+        ([[0, -1]], GOOD, None, r"truth\[0, 1\]: .* found -1"),
         ([[0.0, 1.0]], GOOD, None, "truth: expected integer class ids"),
         ([[0, 1]], GOOD, [[True]], r"valid: expected bool of shape \(1, 2\)"),
         ([[0, 1]], GOOD, [[1, 0]], "valid: expected bool"),
@@ -195,6 +196,13 @@ def test_bins_are_fifteen_of_equal_width_and_a_value_between_two_is_of_the_upper
     halves[..., :2] = 0.5
     result = Calibration(bins=2).update([[0]], halves).compute()
     assert [row["points"] for row in result["confidence_bins"]] == [0, 1]
+
+
+def test_no_rounding_gives_more_entropy_than_there_can_be():
+    rounded = np.full((1, 1, CLASSES), 0.1015, np.float32)
+    result = Calibration().update([[0]], rounded).compute()
+    assert result["entropy"] == pytest.approx(np.log(CLASSES), abs=1e-8)
+    assert result["entropy_bins"][-1]["points"] == 1
 
 
 def test_probabilities_of_points_that_are_not_counted_may_be_anything():
