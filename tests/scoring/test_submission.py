@@ -173,31 +173,35 @@ def test_an_error_while_writing_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((np.arange(2.0), np.zeros((2, 4), np.uint8)), "scan_index: expected int64"),
-        ((np.arange(2), np.zeros((3, 4), np.uint8)), r"labels: expected uint8 \(2, any\)"),
-        ((np.arange(2), np.zeros((2, 4), np.int64)), "labels: expected uint8"),
-        ((np.arange(2), np.full((2, 4), 10, np.uint8)), "class ids 0 to 9, found 10"),
-        (
-            (np.arange(2), np.zeros((2, 4), np.uint8), np.zeros((2, 4, 9), np.float16)),
-            r"probabilities: expected float16 \(2, 4, 10\)",
-        ),
-        (
-            (np.arange(2), np.zeros((2, 4), np.uint8), None, np.zeros((3, 2, 5), np.uint8)),
-            r"samples: expected uint8 \(any, 2, 4\)",
-        ),
-        ((np.arange(2), np.zeros((2, 5), np.uint8)), "the same parts, beams and samples"),
-    ],
-)
-def test_writer_refuses_what_the_validator_would(tmp_path, arguments, message):
+UNFIT = [
+    ("scan_index: expected int64", np.arange(2.0), np.zeros((2, 4), np.uint8)),
+    (r"labels: expected uint8 \(2, any\)", np.arange(2), np.zeros((3, 4), np.uint8)),
+    ("labels: expected uint8", np.arange(2), np.zeros((2, 4), np.int64)),
+    ("class ids 0 to 9, found 10", np.arange(2), np.full((2, 4), 10, np.uint8)),
+    (
+        r"probabilities: expected float16 \(2, 4, 10\)",
+        *(np.arange(2), np.zeros((2, 4), np.uint8), np.zeros((2, 4, 9), np.float16)),
+    ),
+    (
+        r"samples: expected uint8 \(any, 2, 4\)",
+        *(np.arange(2), np.zeros((2, 4), np.uint8), None, np.zeros((3, 2, 5), np.uint8)),
+    ),
+    ("the same parts, beams and samples", np.arange(2), np.zeros((2, 5), np.uint8)),
+]
+
+
+def test_writer_refuses_what_the_validator_would(tmp_path):
     with writer_of(tmp_path / "p.h5") as writer:
         writer.add(FIRST, np.arange(2), np.zeros((2, 4), np.uint8))
-        with pytest.raises(InvalidInputError, match=message):
-            writer.add(FIRST, *arguments)
+        for message, *arrays in UNFIT:
+            with pytest.raises(InvalidInputError, match=message):
+                writer.add(FIRST, *arrays)
+        with pytest.raises(InvalidInputError, match="class ids 0 to 9, found 11"):
+            samples = np.full((1, 2, 4), 11, np.uint8)
+            writer.add("hall--b--near", np.arange(2), samples[0] - 11, samples=samples)
     with PredictionsReader(tmp_path / "p.h5") as reader:
         assert reader.shape(FIRST, "labels") == (2, 4)
+        assert reader.sequence_ids == (FIRST,)
 
 
 @pytest.mark.parametrize(
