@@ -9,9 +9,9 @@ from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.executors import Processes
 from semantic2d_dataset.scene.geometry import to_base, to_points, transform
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
+from semantic2d_dataset.scoring import comparison
 from semantic2d_dataset.scoring.comparison import (
     CELL_M,
-    OUTCOMES,
     compare_predictions,
     format_comparison,
 )
@@ -69,7 +69,8 @@ def named(pair, data, tmp_path):
     return files
 
 
-def test_outcomes_and_cells_are_those_of_the_points(named, data):
+def test_outcomes_and_cells_are_those_of_the_points(named, data, monkeypatch):
+    monkeypatch.setattr(comparison, "_BLOCK", 7)  # scans at a time
     found = compare_predictions(*named, data)
     outcomes = np.zeros(4, int)
     cells = {}
@@ -87,7 +88,16 @@ def test_outcomes_and_cells_are_those_of_the_points(named, data):
             outcomes[outcome] += 1
             cell = (entry.environment, *np.floor(points[n, k] / CELL_M).astype(int).tolist())
             cells.setdefault(cell, np.zeros(4, int))[outcome] += 1
-    assert found.outcomes == dict(zip(OUTCOMES, outcomes.tolist(), strict=True))
+    both, only_a, only_b, neither = outcomes.tolist()
+    assert found.outcomes == {
+        "both": both,
+        "only_a": only_a,
+        "only_b": only_b,
+        "neither": neither,
+    }
+    telling = [place.outcomes[1] + place.outcomes[2] for place in found.places]
+    assert telling == sorted(telling, reverse=True)
+    assert (np.sum([place.outcomes for place in found.places], axis=0) == outcomes).all()
     for place in found.places:
         for cell, counts in zip(place.cells.tolist(), place.counts, strict=True):
             assert (cells.pop((place.environment, *cell)) == counts).all()
@@ -101,8 +111,18 @@ def test_scores_are_those_of_the_two_results(named, data):
         row = found.scores[name]
         assert row["a"] == pytest.approx(a[name], abs=1e-12)
         assert row["difference"] == pytest.approx(b[name] - a[name], abs=1e-12)
-    band = found.conditions["range_m"]["4-8"]
-    assert band["b"] == b["conditions"]["range_m"]["4-8"]["mIoU"]
+    assert set(found.conditions) == {*a["conditions"]} - {"environment"}
+    for name, bands in found.conditions.items():
+        assert bands
+        for band, row in bands.items():
+            one, other = (result["conditions"][name][band] for result in (a, b))
+            figure = "mCA" if name == "motion" else "mIoU"
+            assert (row["a"], row["b"], row["points"]) == (
+                one[figure],
+                other[figure],
+                one["points"],
+            )
+            assert row["difference"] == row["b"] - row["a"]
     assert found.scores["mIoU"]["difference"] > 0
     with Processes(2) as executor:
         again = compare_predictions(*named, data, executor=executor)
