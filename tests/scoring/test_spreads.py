@@ -37,14 +37,30 @@ def test_a_spread_is_mean_and_standard_deviation_of_every_score():
     assert spread(results[:1])["mCA"]["std"] == 0.0
 
 
+def test_a_score_of_zero_counts_and_one_that_is_missing_does_not():
+    results = [Evaluator().update([1, 2], guess).compute() for guess in ([1, 2], [2, 1], [1, 9])]
+    classes = spread(results)["classes"]
+    assert classes["Chair"]["iou"] == {"mean": np.mean([1, 0, 1]), "std": np.std([1, 0, 1])}
+    assert classes["Wall"]["iou"] == {"mean": 0.0, "std": 0.0}
+    assert classes["Wall"]["ca"] is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["dataset", "dataset_version", "scheme", "split", "lidars", "scans", "evaluator_version"],
+)
+def test_results_of_different_tasks_have_no_spread(name):
+    with pytest.raises(InvalidInputError, match=f"^{name} is .* and 'other' in another"):
+        spread_of_seeds([result(0), result(1, **{name: "other"})])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"split": "val"}, "split is 'test' in one file and 'val' in another"),
         ({"metadata": {"method": "other"}}, "semantic2d compare"),
         ({"digests": {"predictions": "0"}}, "two of the files are the same"),
     ],
 )
-def test_only_several_seeds_of_one_method_and_task_have_a_spread(changes, message):
+def test_only_several_seeds_of_one_method_have_a_spread(changes, message):
     with pytest.raises(InvalidInputError, match=message):
         spread_of_seeds([result(0), result(1, **changes)])
