@@ -29,8 +29,9 @@ def test_a_spread_is_mean_and_standard_deviation_of_every_score():
     results = [result(seed) for seed in range(4)]
     said = spread_of_seeds(results)
     assert said["count"] == 4
-    figures = [each["mIoU"] for each in results]
-    assert said["mIoU"] == {"mean": np.mean(figures), "std": np.std(figures)}
+    for mean in ("mIoU", "mCA", "mCA_tn"):
+        figures = [each[mean] for each in results]
+        assert said[mean] == {"mean": np.mean(figures), "std": np.std(figures)}
     figures = [each["Chair"]["ca"] for each in results]
     assert said["classes"]["Chair"]["ca"] == {"mean": np.mean(figures), "std": np.std(figures)}
     assert said["classes"]["Wall"]["iou"] is None
