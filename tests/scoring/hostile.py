@@ -108,7 +108,7 @@ def many_rows_that_are_not_there(file, _):
 
 @crafted
 def bomb_of_scan_indices(file, _):
-    bomb(file, INDEX, (60_000_000,), (6_000_000,), np.int64)
+    bomb(file, INDEX, (60_000_000,), (2_000_000,), np.int64)
 
 
 @crafted

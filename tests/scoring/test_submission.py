@@ -410,6 +410,16 @@ MUTATIONS = {
         np.stack((first_labels(), first_labels(at={(4, 1): 11}))),
         f"{FIRST}/6: samples: beam 1 holds 11",
     ),
+    "too many samples": (
+        "samples",
+        np.zeros((1025, len(TEST_SCANS), 12), np.uint8),
+        f"{FIRST}: samples: expected 1 to 1024, found 1025",
+    ),
+    "classes": (
+        "probabilities",
+        np.full((len(TEST_SCANS), 12, 9), 1 / 9, np.float16),
+        "probabilities: expected shape (68, 12, 10), found (68, 12, 9)",
+    ),
     "samples shape": ("samples", first_labels()[None, 1:], "samples: expected shape (any, 68, 12)"),
 }
 
@@ -484,6 +494,16 @@ def test_all_problems_are_listed_at_once(dataset, copy):
     found = validate(copy, dataset)
     assert len(found) == 5
     assert "metadata.method" in found[1]
+
+
+def test_a_thousand_problems_are_listed_and_the_rest_counted(dataset, copy):
+    with h5py.File(copy, "r+") as file:
+        for n in range(1_100):
+            file.create_group(f"predictions/{n}{'x' * 600}")
+    found = validate(copy, dataset)
+    assert len(found) == 1_001
+    assert found[-1] == "and 100 more such problems"
+    assert {len(problem) for problem in found[:-1]} == {504}
 
 
 @pytest.mark.parametrize("text", [b"{", b"[]", b'"method"', b"\xff"])
