@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from semantic2d_dataset.access.registry import open_dataset
-from semantic2d_dataset.errors import Semantic2DError
+from semantic2d_dataset.errors import CorruptFileError, Semantic2DError, UnsafeFileError
 from semantic2d_dataset.format.manifest import publish
 from semantic2d_dataset.format.splits import NONE, TEST, VAL, SplitScheme
 from semantic2d_dataset.scene.taxonomy import SEMANTIC2D
-from semantic2d_dataset.scoring.submission import validate
+from semantic2d_dataset.scoring.submission import PredictionsReader, validate
 from tests.conftest import PROJECT
 from tests.scoring import hostile
 from tests.scoring.test_submission import (
@@ -209,3 +209,19 @@ def test_messages_about_names_hold_nothing_for_terminals(toy, good, tmp_path):
     problems = validate(path, open_dataset(toy))
     assert problems[0].startswith("?[2Jx: the split has no scan of this sequence")
     assert all(problem.isprintable() for problem in problems)
+
+
+def test_what_readers_would_have_to_hold_is_limited(toy, good, tmp_path):
+    path = tmp_path / "x.h5"
+    shutil.copy(good, path)
+    with h5py.File(path, "r+") as file:
+        hostile.meta(file, b'{"method": "m"}' + b" " * (1 << 16))
+        hostile.bomb(file, hostile.LABELS, (1000, 100_000), (1000, 1000), np.uint8)
+        hostile.bomb(file, hostile.SAMPLES, (1, 1, 1), (1, 1 << 12, 1 << 13), np.uint8, (None,) * 3)
+    with PredictionsReader(path) as reader:
+        with pytest.raises(CorruptFileError, match="expected at most 65536 bytes"):
+            _ = reader.metadata
+        with pytest.raises(UnsafeFileError, match="make readers hold 100000000 bytes at once"):
+            reader.blocks(hostile.FIRST, "labels")
+        with pytest.raises(UnsafeFileError, match="chunks of at most 16777216 bytes"):
+            reader.read(hostile.FIRST, "samples")

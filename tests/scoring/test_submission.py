@@ -154,8 +154,10 @@ def test_predictions_come_back_as_written(dataset, tmp_path):
     samples = rng.integers(0, 10, (3, 5, 12)).astype(np.uint8)
     with writer_of(tmp_path / "p.h5", metadata={"method": "m", "seeds": [1]}) as writer:
         for rows in (slice(0, 2), slice(2, 5)):
-            part = (labels[rows], probabilities[rows], samples[:, rows])
+            part = [array.copy() for array in (labels[rows], probabilities[rows], samples[:, rows])]
             writer.add(FIRST, np.arange(5)[rows], *part)
+            for array in part:
+                array.fill(0)  # callers may use their arrays again
     with PredictionsReader(tmp_path / "p.h5") as reader:
         assert reader.sequence_ids == (FIRST,)
         assert (reader.read(FIRST, "scan_index") == np.arange(5)).all()
