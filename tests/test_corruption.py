@@ -126,10 +126,11 @@ def test_dropped_and_far_beams_have_no_return_and_others_are_as_they_were():
     assert after["ranges"][there].max() < 4.0
 
 
-def test_coarse_beams_are_those_of_their_nearest_kept_one_with_its_label():
+@pytest.mark.parametrize(("severity", "step"), [(3, 4), (5, 8)])
+def test_coarse_beams_are_those_of_their_nearest_kept_one_with_its_label(severity, step):
     before = make_fields()
-    after = apply("coarse", 3, before)
-    kept = np.arange(0, SMALL_LIDAR.beams, 4)
+    after = apply("coarse", severity, before)
+    kept = np.arange(0, SMALL_LIDAR.beams, step)
     for name, values in after.items():
         np.testing.assert_array_equal(values[:, kept], before[name][:, kept])
         for k, near in enumerate(values.T):  # halfway between two, either may stand for it
