@@ -9,10 +9,11 @@ from typing import Any
 from leaderboard.at_hand import AtHand
 from leaderboard.entries import Entry, Source
 from leaderboard.figures import Problem, differences
-from leaderboard.seeds import run_of, shared_metadata
+from leaderboard.seeds import run_of
 from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.errors import Semantic2DError, SubmissionError
 from semantic2d_dataset.scoring.metrics import EVALUATOR_VERSION
+from semantic2d_dataset.scoring.spreads import shared_metadata
 from semantic2d_dataset.scoring.submission import score_predictions
 
 _TRACK = ("dataset", "dataset_version", "scheme", "split", "lidars", "scans")

@@ -19,9 +19,6 @@ from semantic2d_dataset.scene.taxonomy import Taxonomy
 from semantic2d_dataset.scoring.metrics import Evaluator
 from semantic2d_dataset.scoring.spreads import spread, spread_of_seeds
 
-OF_A_RUN = ("seeds", "hardware", "scans_per_second", "scans_per_second_measured")
-"""Metadata in which the trainings of one method may differ."""
-
 
 def summarise(
     results: Sequence[Mapping[str, Any]], urls: Sequence[str] = ()
@@ -48,8 +45,7 @@ def summarise(
     InvalidInputError
         If they are not trainings of one method on one task, or two are the same.
     """
-    spread_of_seeds(results)  # refuses other tasks, and a file that is given twice
-    _refuse_other_methods([result["submission"]["metadata"] for result in results])
+    spread_of_seeds(results)  # refuses other tasks and methods, and a file that is given twice
     places: Sequence[str | None] = urls or [None] * len(results)
     pairs = [(run_of(one, url), one) for one, url in zip(results, places, strict=True)]
     pairs.sort(key=lambda pair: _order(pair[0]))
@@ -70,11 +66,6 @@ def run_of(result: Mapping[str, Any], url: str | None) -> dict[str, Any]:
     run = {"predictions": said["digests"]["predictions"], "seeds": said["metadata"].get("seeds")}
     run |= {"url": url, "per_lidar": _without_intervals(result["per_lidar"])}
     return {name: value for name, value in run.items() if value is not None}
-
-
-def shared_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what every training of a method must say alike."""
-    return {name: value for name, value in metadata.items() if name not in OF_A_RUN}
 
 
 def names_of_runs(runs: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
@@ -127,18 +118,6 @@ def _without_intervals(per_lidar: Mapping[str, Mapping[str, Any]]) -> dict[str, 
         lidar: {name: value for name, value in scores.items() if name != "intervals"}
         for lidar, scores in per_lidar.items()
     }
-
-
-def _refuse_other_methods(metadata: Sequence[Mapping[str, Any]]) -> None:
-    first, *others = map(shared_metadata, metadata)
-    for other in others:
-        for name in sorted({*first, *other}):
-            one, two = first.get(name), other.get(name)
-            if one != two:
-                raise InvalidInputError(
-                    f"metadata.{name} is {one!r} in one file and {two!r} in another; seeds of one "
-                    f"method say the same of it, but for {', '.join(OF_A_RUN)}"
-                )
 
 
 def _order(run: Mapping[str, Any]) -> tuple[list[int], str]:

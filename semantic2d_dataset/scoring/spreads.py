@@ -11,6 +11,9 @@ from semantic2d_dataset.errors import InvalidInputError
 from semantic2d_dataset.scoring.metrics import MEANS, class_names
 
 _FIGURES = ("iou", "ca")
+OF_A_TRAINING = ("seeds", "hardware", "scans_per_second", "scans_per_second_measured")
+"""Metadata in which the trainings of one method may differ."""
+
 _TASK = ("dataset", "dataset_version", "scheme", "split", "lidars", "scans", "evaluator_version")
 
 
@@ -46,24 +49,30 @@ def spread_of_seeds(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     InvalidInputError
         If they are of different methods or tasks, or two are of the same predictions.
     """
-    said = [result["submission"] for result in results]
-    for each in said[1:]:
-        for name in _TASK:
-            if each[name] != said[0][name]:
-                raise InvalidInputError(
-                    f"{name} is {said[0][name]!r} in one file and {each[name]!r} in another; "
-                    "only predictions of one task have a spread"
-                )
-        if each["metadata"]["method"] != said[0]["metadata"]["method"]:
-            raise InvalidInputError(
-                f"the files are of the methods {said[0]['metadata']['method']!r} and "
-                f"{each['metadata']['method']!r}; give several seeds of one method, or compare "
-                "two methods with: semantic2d compare"
-            )
-    digests = [each["digests"]["predictions"] for each in said]
+    first, *others = [result["submission"] for result in results]
+    for other in others:
+        _check_alike({name: (first[name], other[name]) for name in _TASK}, "one task")
+        own, its = (shared_metadata(said["metadata"]) for said in (first, other))
+        pairs = {f"metadata.{name}": (own.get(name), its.get(name)) for name in {*own, *its}}
+        _check_alike(pairs, "one method")
+    digests = [result["submission"]["digests"]["predictions"] for result in results]
     if len({*digests}) != len(digests):
         raise InvalidInputError("two of the files are the same; give each seed once")
     return spread(results)
+
+
+def shared_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what every training of a method must say alike."""
+    return {name: value for name, value in metadata.items() if name not in OF_A_TRAINING}
+
+
+def _check_alike(pairs: Mapping[str, tuple[Any, Any]], of: str) -> None:
+    for name, (one, other) in sorted(pairs.items()):
+        if one != other:
+            raise InvalidInputError(
+                f"{name} is {one!r} in one file and {other!r} in another; only results of {of} "
+                "have a spread; put two beside each other with: semantic2d compare"
+            )
 
 
 def _mean_and_std(figures: list[float | None]) -> dict[str, float] | None:

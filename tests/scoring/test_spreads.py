@@ -58,10 +58,16 @@ def test_results_of_different_tasks_have_no_spread(name):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"metadata": {"method": "other"}}, "semantic2d compare"),
+        ({"metadata": {"method": "other"}}, "only results of one method .* semantic2d compare"),
+        ({"metadata": {"method": "guess", "features": "RI"}}, "metadata.features is None"),
         ({"digests": {"predictions": "0"}}, "two of the files are the same"),
     ],
 )
 def test_only_several_seeds_of_one_method_have_a_spread(changes, message):
     with pytest.raises(InvalidInputError, match=message):
         spread_of_seeds([result(0), result(1, **changes)])
+
+
+def test_trainings_may_differ_in_their_seeds_and_where_they_were_timed():
+    timed = {"method": "guess", "seeds": [1], "hardware": "another", "scans_per_second": 3.0}
+    assert spread_of_seeds([result(0), result(1, metadata=timed)])["count"] == 2
