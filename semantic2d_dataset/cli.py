@@ -17,20 +17,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import semantic2d_dataset
+from semantic2d_dataset.cli_corruption import corrupt, robustness
 from semantic2d_dataset.cli_data import download, list_, remove, show, verify
 from semantic2d_dataset.cli_options import AsJson, Jobs, Scheduler
 from semantic2d_dataset.cli_publishing import card, contribute, diff, release
+from semantic2d_dataset.cli_scoring import compare, report, score, score_merge, score_part
 from semantic2d_dataset.cli_splits import splits
-from semantic2d_dataset.cli_submission import (
-    compare,
-    corrupt,
-    report,
-    robustness,
-    score,
-    score_merge,
-    score_part,
-    submission,
-)
+from semantic2d_dataset.cli_submission import submission
 from semantic2d_dataset.cli_table import table
 from semantic2d_dataset.errors import InvalidInputError, LeakageWarning, Semantic2DError
 from semantic2d_dataset.pipeline.siblings import load_sibling

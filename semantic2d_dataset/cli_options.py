@@ -18,6 +18,9 @@ Scheduler = Annotated[
     str | None,
     typer.Option(help="Dask scheduler (tcp://host:8786) whose workers see the same files."),
 ]
+Data = Annotated[str | None, typer.Option(help="Data set folder or name; else as the file says.")]
+SchemeName = Annotated[str | None, typer.Option(help="Split scheme; else as the file says.")]
+SplitName = Annotated[str | None, typer.Option(help="Split; else as the file says.")]
 
 
 def open_for(predictions: Path, data: str | None) -> OpenDataset:
@@ -41,3 +44,11 @@ def open_for(predictions: Path, data: str | None) -> OpenDataset:
         raise DatasetNotFoundError(
             f"{err}\n{predictions} names it; if you have it in a folder, add --data FOLDER"
         ) from err
+
+
+def check_out(out: Path | None, *sources: Path) -> None:
+    """Refuse, before any work, an output that cannot be written or would replace an input."""
+    from semantic2d_dataset.format.writing import check_target
+
+    if out is not None:
+        check_target(out, sources, force=True)

@@ -36,6 +36,8 @@ ROOMS = (
     "cli_publishing",
     "cli_splits",
     "cli_table",
+    "cli_scoring",
+    "cli_corruption",
     "cli_submission",
     "cli",
 )

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from semantic2d_dataset import cli, cli_submission
+from semantic2d_dataset import cli, cli_corruption
 from semantic2d_dataset.access.registry import open_dataset
 from semantic2d_dataset.corruption import (
     GENERATOR_VERSION,
@@ -277,7 +277,7 @@ def test_the_corrupted_set_of_mini_is_pinned(mini, tmp_path):
 def test_the_command_says_all_kinds_and_refuses_a_file_or_a_place_that_is_not_there(
     dataset_folder, tmp_path, monkeypatch, capsys
 ):
-    assert cli_submission._KINDS.startswith(", ".join([*KINDS][:-1]) + f" or {[*KINDS][-1]};")
+    assert cli_corruption._KINDS.startswith(", ".join([*KINDS][:-1]) + f" or {[*KINDS][-1]};")
     (tmp_path / "file").touch()
     cases = {"file": "is a file", "no/where": "does not exist"}
     for out, message in cases.items():

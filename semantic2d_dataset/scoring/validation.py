@@ -160,7 +160,10 @@ def task_of(
         raise InvalidInputError(
             f"the file predicts no sequence that has scans in split {split!r} of scheme {scheme!r}"
         )
-    taxonomies = {dataset.reader(name).header.taxonomy for name in scans}
+    taxonomies = set()
+    for name in scans:
+        with dataset.reader(name) as reader:
+            taxonomies.add(reader.header.taxonomy)
     if len(taxonomies) != 1:
         raise InvalidInputError(
             f"{dataset.manifest.name}: its sequences use {len(taxonomies)} taxonomies; "

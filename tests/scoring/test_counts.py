@@ -77,9 +77,9 @@ def test_parts_hold_every_sequence_once(data, parts):
     assert sorted(names) == sorted(entry.id for entry in data.manifest.sequences)
 
 
-def run(*words):
+def run(*words, folder=PROJECT):
     command = [sys.executable, "-m", "semantic2d_dataset.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=PROJECT, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False)
 
 
 def start(*words):
@@ -99,8 +99,16 @@ def test_four_processes_and_a_cluster_write_the_same_bytes(data, predictions, tm
     assert run("score-merge", *files, "--out", tmp_path / "merged.json").returncode == 0
     assert run("score", predictions, *where, "--out", tmp_path / "alone.json").returncode == 0
     with cluster(tmp_path) as (address, _):
-        words = ("--scheduler", address, "--out", tmp_path / "cluster.json")
-        assert run("score", predictions, *where, *words).returncode == 0
+        words = (
+            "--data",
+            data.root.name,
+            "--scheduler",
+            address,
+            "--out",
+            tmp_path / "cluster.json",
+        )
+        relative = f"../{predictions.parent.name}/{predictions.name}"
+        assert run("score", relative, *words, folder=data.root.parent).returncode == 0
     alone = (tmp_path / "alone.json").read_bytes()
     assert (tmp_path / "merged.json").read_bytes() == alone
     assert (tmp_path / "cluster.json").read_bytes() == alone
