@@ -49,7 +49,7 @@ def read_yaml(path: Path, *, kind: str = "a YAML file", several: bool = False) -
         text = Path(path).read_text(encoding="utf-8")
         found = next(iter(yaml.safe_load_all(text)), None) if several else yaml.safe_load(text)
     except _FAILURES as err:
-        said = " ".join(str(err).split())
+        said = " ".join(str(err).replace(' in "<unicode string>",', " at").split())
         raise InvalidInputError(f"{path}: not {kind}: {said}") from err
     if _count(found, {}) > _MAX_VALUES:
         raise InvalidInputError(
