@@ -13,6 +13,10 @@ from tests.generators import make_dataset
 settings.register_profile("project", deadline=None, print_blob=True)
 settings.load_profile("project")
 
+# for the processes that tests run in and start: two of them share two cores
+for _library in ("OMP", "OPENBLAS"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / "shared" / "data"
 

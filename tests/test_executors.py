@@ -125,7 +125,7 @@ def test_an_item_that_kills_its_process_twice_is_told():
         assert list(executor.map(square, [5])) == [25]
 
 
-@pytest.mark.parametrize("in_order", [True, False])
+@pytest.mark.parametrize("in_order", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_items_that_kill_their_process_take_no_other_with_them(in_order):
     """Items are slow, so that one is tried once more while another is about to kill."""
     with Processes(2) as executor:

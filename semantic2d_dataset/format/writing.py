@@ -78,7 +78,8 @@ class ContainerWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
-            env=os.environ | {"PYTHONPATH": _import_path()},
+            # it computes nothing: starting threads for numpy would double its start-up
+            env=os.environ | {"PYTHONPATH": _import_path(), "OPENBLAS_NUM_THREADS": "1"},
             start_new_session=True,  # Ctrl-C reaches us only; the child sees its pipe close
         )
         self._pipe = cast("BinaryIO", self._child.stdin)

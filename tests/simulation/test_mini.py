@@ -164,7 +164,7 @@ def test_interrupted_simulation_stops_within_seconds_and_leaves_no_sequence(tmp_
         "import signal, sys; from pathlib import Path\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a background job\n"
         "from semantic2d_dataset.simulation.mini import simulate_dataset\n"
-        "simulate_dataset(Path(sys.argv[1]), seed=1, environments=['lounge'], scans=5000)"
+        "simulate_dataset(Path(sys.argv[1]), seed=1, environments=['lounge'], scans=20000)"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
