@@ -21,7 +21,7 @@ from typing import Any
 import jsonschema
 
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
-from semantic2d_dataset.format.container import check_version, load_json
+from semantic2d_dataset.format.container import check_version, read_json_file
 from semantic2d_dataset.format.sequence import slug
 from semantic2d_dataset.scene.taxonomy import Taxonomy
 from semantic2d_dataset.scoring.metrics import Evaluator
@@ -250,14 +250,7 @@ def read_entry(path: Path) -> Entry:
     path = Path(path)
     if os.path.lexists(path) and not path.is_file():  # a pipe would be waited for
         raise CorruptFileError(f"{path}: expected a file")
-    with path.open("rb") as stream:
-        content = stream.read(_MAX_BYTES + 1)
-    if len(content) > _MAX_BYTES:
-        raise CorruptFileError(f"{path}: larger than {_MAX_BYTES} bytes; no entry is")
-    try:
-        said = load_json(content)
-    except InvalidInputError as err:
-        raise CorruptFileError(f"{path}: {err}") from err
+    said = read_json_file(path, _MAX_BYTES)
     if isinstance(said, dict) and isinstance(said.get("format_version"), str):
         check_version(path, said["format_version"])
     problems = schema_problems(said)

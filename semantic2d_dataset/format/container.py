@@ -307,6 +307,26 @@ def _plain_value(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
+def read_json_file(path: Path, most_bytes: int) -> Any:
+    """Read a JSON file that came from elsewhere, as `load_json` parses it.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    CorruptFileError
+        If it is larger, or no such JSON.
+    """
+    with path.open("rb") as stream:
+        content = stream.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise CorruptFileError(f"{path}: larger than {most_bytes} bytes; no file of its kind is")
+    try:
+        return load_json(content)
+    except InvalidInputError as err:
+        raise CorruptFileError(f"{path}: {err}") from err
+
+
 def load_json(text: str | bytes) -> Any:
     """Parse JSON that came from elsewhere: finite numbers, Unicode text, no absurd depth.
 

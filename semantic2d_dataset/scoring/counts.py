@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic2d_dataset.errors import CorruptFileError, InvalidInputError
-from semantic2d_dataset.format.container import check_version, load_json
+from semantic2d_dataset.format.container import check_version, read_json_file
 from semantic2d_dataset.format.schema_check import check_document
 from semantic2d_dataset.format.writing import write_text_atomically
 from semantic2d_dataset.scene.taxonomy import Taxonomy
@@ -123,14 +123,7 @@ def read_counts(path: Path) -> Counts:
 
 def _read_document(path: Path) -> Mapping[str, Any]:
     """Read the file, and check its form."""
-    with path.open("rb") as stream:
-        content = stream.read(_MAX_BYTES + 1)
-    if len(content) > _MAX_BYTES:
-        raise CorruptFileError(f"{path}: larger than {_MAX_BYTES} bytes; no file of counts is")
-    try:
-        said = load_json(content)
-    except InvalidInputError as err:
-        raise CorruptFileError(f"{path}: {err}") from err
+    said = read_json_file(path, _MAX_BYTES)
     if not isinstance(said, dict) or said.get("format") != FORMAT:
         raise CorruptFileError(f"{path}: expected counts, which semantic2d score-part writes")
     check_version(path, str(said.get("format_version")))
