@@ -1,4 +1,4 @@
-"""Make the board on semantic2d-mini: sanity rows, detectors, and every trained model of a folder.
+"""Make the board on semantic2d-mini: sanity rows, and every trained model of a folder.
 
 Run with ``python benchmarks/leaderboard_mini.py --runs RUNS --out FOLDER``. RUNS holds folders that
 training left, named ``<model>-<features>-<lidar>-seed<n>`` as ``semantic2d baseline reproduce``
@@ -56,7 +56,7 @@ def main() -> None:
     semantic2d("leaderboard", "published", "--entries", said.entries)
     files = sorted(predictions.glob("*.h5"), key=without_seed)
     for name, seeds in groupby(files, key=without_seed):
-        more = ("--sanity",) if name in SANITY else ()
+        more = ("--sanity",) if name in (*SANITY, *DETECTORS) else ()
         semantic2d("leaderboard", "add", *seeds, "--entries", said.entries, "--force", *more)
     at_hand = ("--entries", said.entries, "--predictions", predictions)
     semantic2d("leaderboard", "check", "--strict", *at_hand)
