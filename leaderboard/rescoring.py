@@ -50,29 +50,48 @@ def score_again(
         return None, f"{track['dataset']} {track['dataset_version']} is not at hand", []
     found = [(source, at_hand.file(source.digest)) for source in entry.sources]
     missing = [source for source, file in found if file is None]
-    problems = list(_name_strangers(entry, missing, at_hand))
+    strangers = [(source, _strangers(entry, source, at_hand)) for source in missing]
+    problems = [
+        (source.field, f"{path.name} scores this, and its SHA-256 is {digest}")
+        for source, there in strangers
+        for digest, path in there.items()
+        if _has_counts(entry, source, path, dataset)
+    ]
     for source, file in found:
         if file is not None:
             problems += _score_one(entry, source, file, dataset)
     if missing:
-        return None, _say_missing(len(found) - len(missing), len(found)), problems
+        names = sorted({path.name for _, there in strangers for path in there.values()})
+        return None, _say_missing(len(found) - len(missing), len(found), names), problems
     return at_hand.file(entry.digest), "", problems
 
 
-def _say_missing(there: int, count: int) -> str:
-    if count == 1:
-        return "its predictions are not at hand"
-    return f"{there} of {count} predictions are at hand"
+def _say_missing(there: int, count: int, strangers: Sequence[str]) -> str:
+    what = f"{there} of {count} predictions are at hand"
+    what = "its predictions are not at hand" if count == 1 else what
+    also = f" ({strangers[0]} says the same of itself, and is another file)" if strangers else ""
+    return what + also
 
 
-def _name_strangers(entry: Entry, missing: Sequence[Source], at_hand: AtHand) -> Iterator[Problem]:
-    """Name files that say they are what is missing, and have another digest."""
-    own = {source.digest for source in entry.sources}
-    for source in missing:
-        namesakes = at_hand.namesakes(entry.said, source.seeds)
-        strangers = [path.name for digest, path in namesakes.items() if digest not in own]
-        if strangers:
-            yield source.field, f"{strangers[0]} is of this method, and its SHA-256 is another"
+def _strangers(entry: Entry, source: Source, at_hand: AtHand) -> dict[str, Path]:
+    """Return, by digest, files that say they are what is missing, and are no part of the entry."""
+    own = {each.digest for each in entry.sources}
+    namesakes = at_hand.namesakes(entry.said, source.seeds)
+    return {digest: path for digest, path in namesakes.items() if digest not in own}
+
+
+def _has_counts(entry: Entry, source: Source, file: Path, dataset: OpenDataset) -> bool:
+    """Tell whether a file has the counts of an entry: else it is another training of the method."""
+    track, said = entry.said["track"], entry.said["result"] if source.run is None else source.run
+    try:
+        found = score_predictions(file, dataset, scheme=track["scheme"], split=track["split"])
+    except Semantic2DError:
+        return False
+    one, other = (
+        {lidar: scores["confusion"] for lidar, scores in each["per_lidar"].items()}
+        for each in (found, said)
+    )
+    return one == other
 
 
 def _score_one(entry: Entry, source: Source, file: Path, dataset: OpenDataset) -> Iterator[Problem]:

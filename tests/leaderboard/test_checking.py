@@ -216,8 +216,8 @@ def test_a_folder_without_entries_is_no_board(tmp_path):
         check_entries(tmp_path / "none", AtHand())
 
 
-def test_predictions_that_were_changed_are_named(board, dataset_folder, tmp_path):
-    """A file of that method and track is there, and its digest is another."""
+def test_other_predictions_of_a_method_are_named_and_no_proof(board, dataset_folder, tmp_path):
+    """Whoever trains a known network again has such a file."""
     shutil.rmtree(board)
     board.mkdir()
     folder = tmp_path / "predictions"
@@ -226,8 +226,19 @@ def test_predictions_that_were_changed_are_named(board, dataset_folder, tmp_path
     add(path, dataset_folder, board)
     write_predictions(path, dataset_folder, method="Mine", seed=8)
     (found,) = check_entries(board, AtHand([str(dataset_folder)], folder))
-    assert found.problems[0][0] == "digests.predictions"
-    assert "mine.h5 is of this method, and its SHA-256 is another" in found.problems[0][1]
+    assert (found.status, found.problems) == (UNVERIFIED, ())
+    assert "mine.h5 says the same of itself, and is another file" in found.reason
+
+
+def test_a_digest_that_was_edited_is_named_where_its_file_is_at_hand(board, at_hand):
+    path, said = one_of(board)
+    digest = said["digests"]["predictions"]
+    said["digests"]["predictions"] = "0" * 64
+    path.write_text(to_json(seal(said)))
+    found = check_entry(path, at_hand)
+    (problem,) = found.problems
+    assert problem[0] == "digests.predictions"
+    assert problem[1].endswith(f"scores this, and its SHA-256 is {digest}")
 
 
 @pytest.mark.parametrize("owner", ["whole", "lidar"])

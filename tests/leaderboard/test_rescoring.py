@@ -82,7 +82,9 @@ def test_metadata_that_another_seed_does_not_say_is_named(
     assert [f for f, _ in check_entry(path, other).problems] == ["metadata.parameters"]
 
 
-def test_a_changed_file_of_a_seed_is_named(board_of_seeds, dataset_folder, some_at_hand):
+def test_another_file_of_a_seed_is_named_and_makes_the_entry_unverified(
+    board_of_seeds, dataset_folder, some_at_hand
+):
     write_predictions(
         some_at_hand.predictions / "seed2.h5",
         dataset_folder,
@@ -92,10 +94,8 @@ def test_a_changed_file_of_a_seed_is_named(board_of_seeds, dataset_folder, some_
         seeds=[2],
     )
     (found,) = check_entries(board_of_seeds, some_at_hand)
-    assert found.status == WRONG
-    (problem,) = found.problems
-    assert problem[0] == "seeds.runs[2].predictions"
-    assert "seed2.h5 is of this method, and its SHA-256 is another" in problem[1]
+    assert (found.status, found.problems) == (UNVERIFIED, ())
+    assert "seed2.h5 says the same of itself, and is another file" in found.reason
 
 
 def test_a_file_of_a_seed_that_the_entry_does_not_name_is_no_problem(
