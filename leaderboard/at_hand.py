@@ -31,6 +31,7 @@ class AtHand:
     predictions: Path | None = None
     _opened: dict[tuple[str, str], OpenDataset | None] = field(default_factory=dict)
     _files: dict[str, Path] | None = None
+    _identities: dict[str, tuple[Any, ...] | None] | None = None
 
     def __post_init__(self) -> None:
         for name in self.data:
@@ -55,9 +56,11 @@ class AtHand:
 
     def namesakes(self, said: Mapping[str, Any], seeds: Any) -> dict[str, Path]:
         """Return, by digest, files that say they are of an entry's method, track and seeds."""
-        return {
-            digest: path for digest, path in self._by_digest().items() if _is_of(path, said, seeds)
-        }
+        wanted = _identity(said["track"], name_of(said["metadata"]), seeds)
+        there = self._by_digest()
+        if self._identities is None:
+            self._identities = {digest: _identity_of(path) for digest, path in there.items()}
+        return {d: path for d, path in there.items() if self._identities[d] == wanted}
 
     def _by_digest(self) -> dict[str, Path]:
         if self._files is None:
@@ -68,15 +71,22 @@ class AtHand:
         return self._files
 
 
-def _is_of(path: Path, said: Mapping[str, Any], seeds: Any) -> bool:
+def _identity(track: Mapping[str, Any], method: str, seeds: Any) -> tuple[Any, ...]:
+    names = ("dataset", "dataset_version", "scheme", "split")
+    return (*(track[name] for name in names), {*track["lidars"]}, method, seeds)
+
+
+def _identity_of(path: Path) -> tuple[Any, ...] | None:
+    """Read what a file says it is, None where it is no predictions file that says it."""
     try:
         with PredictionsReader(path) as reader:
-            metadata, split = reader.metadata, "val" if reader.split == "dev" else reader.split
-            here = (reader.dataset, reader.dataset_version, reader.scheme, split)
-            lidars = {name.rsplit("--", 1)[-1] for name in reader.sequence_ids}
-        track = said["track"]
-        there = tuple(track[n] for n in ("dataset", "dataset_version", "scheme", "split"))
-        same = here == there and lidars == {*track["lidars"]} and metadata.get("seeds") == seeds
-        return same and name_of(metadata) == name_of(said["metadata"])
+            track = {
+                "dataset": reader.dataset,
+                "dataset_version": reader.dataset_version,
+                "scheme": reader.scheme,
+                "split": "val" if reader.split == "dev" else reader.split,
+                "lidars": [name.rsplit("--", 1)[-1] for name in reader.sequence_ids],
+            }
+            return _identity(track, name_of(reader.metadata), reader.metadata.get("seeds"))
     except (Semantic2DError, OSError, KeyError, TypeError):
-        return False
+        return None

@@ -22,7 +22,7 @@ from leaderboard.figures import Problem, differences, find_inconsistencies
 from leaderboard.published import published_entry
 from leaderboard.rescoring import score_again
 from leaderboard.seeds import find_slips_of_seeds
-from leaderboard.twins import find_nearly_same_counts, find_same_counts, find_same_files
+from leaderboard.twins import find_same_counts, find_same_files
 from semantic2d_dataset.access.registry import OpenDataset
 from semantic2d_dataset.errors import Semantic2DError
 
@@ -171,11 +171,7 @@ def _mark_twins(checked: list[Checked]) -> list[Checked]:
     """Refuse the same predictions under two names, and note those that are nearly the same."""
     there = [each.entry for each in checked if each.entry is not None]
     sound = [each.entry for each in checked if each.entry is not None and each.status != WRONG]
-    files, counts, notes = (
-        find_same_files(there),
-        find_same_counts(sound),
-        find_nearly_same_counts(sound),
-    )
+    files, (counts, notes) = find_same_files(there), find_same_counts(sound)
     found = []
     for each in checked:
         twins = _unique([*counts.get(each.path, ()), *files.get(each.path, ())])

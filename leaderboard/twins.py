@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,9 @@ def find_same_files(entries: Sequence[Entry]) -> dict[Path, list[Problem]]:
     return found
 
 
-def find_same_counts(entries: Sequence[Entry]) -> dict[Path, list[Problem]]:
+def find_same_counts(
+    entries: Sequence[Entry],
+) -> tuple[dict[Path, list[Problem]], dict[Path, list[str]]]:
     """Find scored entries that are equal in every count: one file, described in two ways.
 
     Parameters
@@ -62,38 +64,22 @@ def find_same_counts(entries: Sequence[Entry]) -> dict[Path, list[Problem]]:
 
     Returns
     -------
-    dict
+    same
         As `find_same_files`.
+    nearly
+        By file of the entry, in words, those whose counts are nearly those of another.
     """
-    found: dict[Path, list[Problem]] = {}
+    same: dict[Path, list[Problem]] = {}
+    nearly: dict[Path, list[str]] = {}
     for own, other, share in _compared(entries):
+        name = other.entry.path.name
         if share == 0:
-            what = f"these predictions score what those of {other.entry.path.name} do, in every "
-            found.setdefault(own.entry.path, []).append((own.field, f"{what}count"))
-    return found
-
-
-def find_nearly_same_counts(entries: Sequence[Entry]) -> dict[Path, list[str]]:
-    """Note scored entries whose counts are nearly those of another.
-
-    Parameters
-    ----------
-    entries
-        As for `find_same_counts`.
-
-    Returns
-    -------
-    dict
-        By file of the entry, in words.
-    """
-    found: dict[Path, list[str]] = {}
-    for own, other, share in _compared(entries):
-        if 0 < share < NEARLY:
-            found.setdefault(own.entry.path, []).append(
-                f"its counts are those of {other.entry.path.name} but for {100 * share:.2g} % of "
-                "the points; is one made from the other?"
-            )
-    return found
+            what = f"these predictions score what those of {name} do, in every count"
+            same.setdefault(own.entry.path, []).append((own.field, what))
+        elif share < NEARLY:
+            what = f"its counts are those of {name} but for {100 * share:.2g} % of the points"
+            nearly.setdefault(own.entry.path, []).append(f"{what}; is one made from the other?")
+    return same, nearly
 
 
 def _compared(entries: Sequence[Entry]) -> Iterator[tuple[_Counted, _Counted, float]]:
@@ -101,17 +87,17 @@ def _compared(entries: Sequence[Entry]) -> Iterator[tuple[_Counted, _Counted, fl
 
     Points that change their predicted class move from one count to another.
     """
-    groups: dict[str, list[_Counted]] = {}
+    groups: dict[Any, list[_Counted]] = {}
     for entry in entries:
         if entry.kind == SCORED:
-            said = entry.said
-            task = json.dumps([said["track"], said["digests"]["split"], said["evaluator_version"]])
-            groups.setdefault(task, []).extend(_counted(entry))
+            groups.setdefault(tuple(entry.tracks()), []).extend(_counted(entry))
     for group in groups.values():
-        for own, other in itertools.permutations(group, 2):
-            if own.entry.path != other.entry.path:
-                moved = np.abs(own.confusion - other.confusion).sum() / 2
-                yield own, other, float(moved / max(1, own.confusion.sum()))
+        for one, other in itertools.combinations(group, 2):
+            if one.entry.path != other.entry.path:
+                moved = np.abs(one.confusion - other.confusion).sum() / 2
+                share = float(moved / max(1, one.confusion.sum()))
+                yield one, other, share
+                yield other, one, share
 
 
 def _counted(entry: Entry) -> Iterator[_Counted]:

@@ -7,7 +7,7 @@ import pytest
 from leaderboard.at_hand import AtHand
 from leaderboard.checking import VERIFIED, WRONG, check_entries, format_check
 from leaderboard.entries import read_entry, seal, to_json
-from leaderboard.twins import find_nearly_same_counts, find_same_counts, find_same_files
+from leaderboard.twins import find_same_counts, find_same_files
 from semantic2d_dataset.scoring.about import pack
 from tests.leaderboard.boards import add, add_seeds
 
@@ -29,7 +29,7 @@ def copied(board, predictions_folder, dataset_folder, tmp_path):
 
 def test_predictions_packed_again_under_another_name_are_found(board, copied):
     assert find_same_files(entries_of(board)) == {}
-    found = find_same_counts(entries_of(board))
+    found, _ = find_same_counts(entries_of(board))
     (good,) = (path for path in found if path.name.endswith("good.json"))
     (superb,) = (path for path in found if path.name.endswith("super.json"))
     assert found[good] == [
@@ -47,7 +47,7 @@ def test_one_seed_of_another_method_is_found_too(
 ):
     pack(seeds_folder / "seed2.h5", {"method": "Mine"}, tmp_path / "p.h5")
     add(tmp_path / "p.h5", dataset_folder, board_of_seeds)
-    found = find_same_counts(entries_of(board_of_seeds))
+    found, _ = find_same_counts(entries_of(board_of_seeds))
     assert sorted(field for slips in found.values() for field, _ in slips) == [
         "digests.predictions",
         "seeds.runs[2].predictions",
@@ -62,9 +62,8 @@ def test_a_copy_with_some_labels_changed_is_noted_and_not_refused(
             group["labels"][0, :3] = 3
     next(board.glob("*super.json")).unlink()
     add(copied, dataset_folder, board)
-    assert find_same_counts(entries_of(board)) == {}
-    notes = find_nearly_same_counts(entries_of(board))
-    assert len(notes) == 2
+    same, nearly = find_same_counts(entries_of(board))
+    assert (same, len(nearly)) == ({}, 2)
     shutil.copytree(predictions_folder, tmp_path / "predictions")
     shutil.copy(copied, tmp_path / "predictions")
     at_hand = AtHand([str(dataset_folder)], tmp_path / "predictions")
@@ -74,7 +73,7 @@ def test_a_copy_with_some_labels_changed_is_noted_and_not_refused(
 
 
 def test_methods_of_different_skill_are_no_copies(board):
-    assert find_nearly_same_counts(entries_of(board)) == find_same_counts(entries_of(board)) == {}
+    assert find_same_counts(entries_of(board)) == ({}, {})
 
 
 def test_equal_counts_on_two_tasks_or_of_a_sanity_row_are_no_copies(
@@ -86,7 +85,7 @@ def test_equal_counts_on_two_tasks_or_of_a_sanity_row_are_no_copies(
     (board / "other.json").write_text(to_json(seal(other)))
     other = json.loads(path.read_text()) | {"kind": "sanity"}
     (board / "sanity.json").write_text(to_json(seal(other)))
-    assert find_same_counts(entries_of(board)) == {}
+    assert find_same_counts(entries_of(board)) == ({}, {})
 
 
 def test_seeds_of_one_entry_are_not_compared_with_each_other(
@@ -94,4 +93,14 @@ def test_seeds_of_one_entry_are_not_compared_with_each_other(
 ):
     (tmp_path / "entries").mkdir()
     add_seeds(sorted(seeds_folder.iterdir()), dataset_folder, tmp_path / "entries")
-    assert find_same_counts(entries_of(tmp_path / "entries")) == {}
+    assert find_same_counts(entries_of(tmp_path / "entries")) == ({}, {})
+
+
+def test_counts_of_other_classes_are_not_compared(board):
+    path = next(board.glob("*good.json"))
+    other = json.loads(path.read_text())
+    for scores in (other["result"], other["result"]["per_lidar"][LIDAR]):
+        scores["confusion"] = [row[:-1] for row in scores["confusion"][:-1]]
+    other["digests"]["taxonomy"] = "0" * 64
+    (board / "other.json").write_text(to_json(seal(other)))
+    assert find_same_counts(entries_of(board)) == ({}, {})
